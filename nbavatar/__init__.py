@@ -1,0 +1,5 @@
+"""NBAvatar: head avatars with hand-face contact, made of neural billboards."""
+
+__version__ = "0.1.0"
+
+__all__ = ["__version__"]

@@ -1,0 +1,1 @@
+"""Pinhole cameras, intrinsics and distortion."""

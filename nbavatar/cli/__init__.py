@@ -1,0 +1,98 @@
+"""The command line: `nbavatar <verb>`.
+
+Each verb is one module of this package with `add_arguments(parser)` and `main(args)`. Only the verb that was
+asked for is imported, so `nbavatar --help` and light stages start at once.
+"""
+
+import argparse
+import contextlib
+import errno
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from nbavatar import __version__
+from nbavatar.errors import NBAvatarError, did_you_mean
+
+__all__ = ["VERBS", "main"]
+
+VERBS = {
+    "synthesize": "write a complete synthetic dataset in Decaf's layout, body models included",
+    "check": "validate a capture (or a Decaf folder) and draw meshes over its images",
+    "ingest": "one camera's video or image folder -> frame pack",
+    "tracks": "a subject's parameters, keypoints and meshes -> one mesh sequence",
+    "masks": "person matte + meshes -> head and hand labels and coverage",
+    "crop": "undistort, crop and resize frames and labels, intrinsics carried along",
+    "fit": "multi-view refit of head and hand models",
+    "spectral": "spectral coordinates of the meshes",
+    "deform": "contact deformation of the head by the hand, cached to NPZ and EXR",
+    "train": "train an avatar",
+    "render": "render an avatar under a protocol",
+    "evaluate": "PSNR, SSIM and LPIPS of stored renders",
+    "speed": "time rasterization and neural rendering of an avatar",
+    "table": "one table of the paper, printed and reproduced values side by side",
+    "report": "one self-contained HTML page with tables and pictures",
+    "bench": "benchmarks of single kernels: raster, deform, spectral, fit",
+    "doctor": "what this machine can do, and what is missing for which stage",
+    "schema": "write the configuration's JSON schema and reference page",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one verb; returns the exit code (0 done, 2 bad input or usage, 130 interrupted)."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    parser = _top_parser()
+    if not arguments or arguments[0].startswith("-"):
+        parser.parse_args(arguments)
+        parser.print_help()
+        return 0 if arguments else 2
+    verb = arguments[0]
+    if verb not in VERBS:
+        print(f"nbavatar: error: unknown verb '{verb}'; {did_you_mean(verb, VERBS)}", file=sys.stderr)
+        return 2
+    try:
+        module = importlib.import_module(f"nbavatar.cli.{verb.replace('-', '_')}")
+        own = argparse.ArgumentParser(
+            prog=f"nbavatar {verb}",
+            description=module.__doc__,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        module.add_arguments(own)
+        return module.main(own.parse_args(arguments[1:])) or 0
+    except NBAvatarError as error:
+        message = str(error)
+    except KeyboardInterrupt:
+        print(f"nbavatar {verb}: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] == "nbavatar":
+            raise
+        message = (
+            f"package '{error.name}' is not installed; see pyproject.toml for the package that provides it, "
+            "or install everything with: make install"
+        )
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.ENOENT, errno.ENOTDIR):
+            raise
+        message = f"{error.filename or 'file system'}: {error.strerror}"
+    print(f"nbavatar {verb}: error: {message}", file=sys.stderr)
+    return 2
+
+
+def _top_parser() -> argparse.ArgumentParser:
+    lines = "\n".join(f"  {verb:<11} {text}" for verb, text in VERBS.items())
+    parser = argparse.ArgumentParser(
+        prog="nbavatar",
+        usage="nbavatar <verb> [options]",
+        description="Head avatars with hand-face contact, made of neural billboards.",
+        epilog=f"verbs, in the order of the pipeline:\n{lines}\n\n`nbavatar <verb> --help` says more. "
+        "The whole pipeline is run by `snakemake` (see README.md); every verb also works alone.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"nbavatar {__version__}")
+    return parser

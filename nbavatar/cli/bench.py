@@ -1,0 +1,46 @@
+"""Benchmarks of single kernels on a realistic scene; figures as JSON with --json.
+
+    nbavatar bench raster    billboard rasterizer, forward and backward, against the reference
+    nbavatar bench deform    contact physics, frames a second with and without contact
+    nbavatar bench spectral  spectral coordinates of a head and hands
+    nbavatar bench fit       multi-view refit, frames a second and millimetres
+
+Times depend on the machine and on what else it does: compare figures of one run only.
+"""
+
+import argparse
+import importlib
+import json
+import sys
+
+__all__ = ["add_arguments", "main"]
+
+_KERNELS = ("raster", "deform", "spectral", "fit")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the kernel's name; each kernel has options of its own."""
+    parser.usage = "nbavatar bench {raster,deform,spectral,fit} [--json] [options of the kernel, see --help after it]"
+    parser.add_argument("kernel", choices=_KERNELS, help="what to measure")
+    parser.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Runs one benchmark and prints its figures."""
+    module = importlib.import_module(f"nbavatar.benchmarks.{args.kernel}")
+    parser = argparse.ArgumentParser(
+        prog=f"nbavatar bench {args.kernel}",
+        description=module.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")
+    module.add_arguments(parser)
+    options = parser.parse_args(args.rest)
+    figures = module.run(options)
+    if options.json:
+        json.dump(figures, sys.stdout, indent=1, sort_keys=True)
+        print()
+    else:
+        for name, value in figures.items():
+            print(f"{name:<24} {value:.6g}" if isinstance(value, float) else f"{name:<24} {value}")
+    return 0

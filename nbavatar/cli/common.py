@@ -1,0 +1,66 @@
+"""What several verbs share: the `--cfg` option, the run's progress bar."""
+
+import argparse
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from nbavatar.config.core import from_mapping
+from nbavatar.errors import ConfigError
+
+__all__ = ["add_cfg_argument", "progress", "read_mapping", "stage_config"]
+
+T = TypeVar("T")
+Item = TypeVar("Item")
+
+
+def add_cfg_argument(parser: argparse.ArgumentParser, cls: type) -> None:
+    """Adds `--cfg`, the options of one stage as JSON text or a file."""
+    parser.add_argument(
+        "--cfg",
+        default="{}",
+        metavar="JSON|FILE",
+        help=f"options of this stage ({cls.__name__}, see config/README.md) as JSON text, "
+        "or a .json or .yaml file; what is not named keeps the paper's value",
+    )
+
+
+def stage_config(args: argparse.Namespace, cls: type[T]) -> T:
+    """The stage's configuration from `--cfg`; wrong keys, types and ranges end in one line."""
+    return from_mapping(cls, read_mapping(args.cfg, "--cfg"), "--cfg")
+
+
+def read_mapping(text: str, option: str) -> dict[str, Any]:
+    """Reads JSON text, or a `.json`, `.yaml` or `.yml` file, that holds a mapping."""
+    where = option
+    if not text.lstrip().startswith("{"):
+        path, where = Path(text), f"{option} {text}"
+        if not path.is_file():
+            raise ConfigError.of(where, expected="JSON text or a file", found="neither")
+        text = path.read_text(encoding="utf-8")
+        if path.suffix in (".yaml", ".yml"):
+            import yaml
+
+            try:
+                value = yaml.safe_load(text)
+            except yaml.YAMLError as error:
+                raise ConfigError.of(where, expected="YAML", found=f"text that does not parse ({error})") from error
+            return _mapping(value, where)
+    try:
+        return _mapping(json.loads(text), where)
+    except json.JSONDecodeError as error:
+        raise ConfigError.of(where, expected="JSON", found=f"text that does not parse ({error})") from error
+
+
+def progress(items: Iterable[Item], description: str, total: int | None = None) -> Iterable[Item]:
+    """Wraps an iterable in a progress bar on standard error."""
+    from tqdm import tqdm
+
+    return tqdm(items, desc=description, total=total, dynamic_ncols=True, mininterval=0.5)
+
+
+def _mapping(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ConfigError.of(where, expected="a mapping", found=type(value).__name__)
+    return value

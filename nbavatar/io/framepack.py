@@ -1,0 +1,150 @@
+"""Frame packs: the one container for images between stages.
+
+A stored zip per (subject, camera) with PNGs `<layer>/<frame>.png` and `manifest.json`. A zip,
+because thousands of loose frames slow every file system and the workflow; stored, because PNG
+is compressed already; PNG, because it is lossless and everything opens it.
+
+    layer   content                                      pixels
+    rgb     colour, sRGB, straight alpha                 uint8 [H, W, 3]
+    person  matte of the whole person, as delivered      uint8 [H, W]
+    label   0 background, 1 head, 2 right, 3 left hand   uint8 [H, W]
+    alpha   coverage of the labelled parts, 255 = full   uint8 [H, W]
+"""
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from nbavatar.errors import DataError
+from nbavatar.io.atomic import atomic_write
+from nbavatar.io.images import decode_image, encode_png
+from nbavatar.io.records import canonical_json
+
+__all__ = ["FORMAT", "FramePack", "FramePackWriter"]
+
+FORMAT = 1
+_MANIFEST = "manifest.json"
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+_REQUIRED = ("stage", "subject", "camera", "width", "height", "cam_from_world", "frames", "layers")
+
+
+class FramePackWriter:
+    """Writes a frame pack; the file appears only when the `with` block succeeds.
+
+    Args:
+        path: target zip.
+        manifest: everything but `format`. May still be changed (through `.manifest`) until the block ends.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], manifest: Mapping[str, Any]) -> None:
+        self.manifest: dict[str, Any] = {"format": FORMAT, **manifest}
+        self._atomic = atomic_write(path)
+        self._written: set[str] = set()
+
+    def __enter__(self) -> Self:
+        self._archive = zipfile.ZipFile(self._atomic.__enter__(), "w", zipfile.ZIP_STORED)
+        return self
+
+    def add(self, layer: str, frame: str, image: np.ndarray) -> None:
+        """Adds one image, uint8 `[H, W]` or `[H, W, 3]`."""
+        name = f"{layer}/{frame}.png"
+        if name in self._written:
+            raise ValueError(f"{name} was added already")
+        self._written.add(name)
+        self._archive.writestr(zipfile.ZipInfo(name, _EPOCH), encode_png(image))
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        if error is None:
+            missing = [key for key in _REQUIRED if key not in self.manifest]
+            lost = [
+                f"{layer}/{frame}"
+                for layer in self.manifest.get("layers", ())
+                for frame in self.manifest.get("frames", ())
+                if f"{layer}/{frame}.png" not in self._written
+            ]
+            if missing or lost:
+                kind, error = ValueError, ValueError(f"frame pack lacks keys {missing}, images {lost[:3]}")
+            else:
+                self._archive.writestr(zipfile.ZipInfo(_MANIFEST, _EPOCH), canonical_json(self.manifest))
+        self._archive.close()
+        self._atomic.__exit__(kind, error, trace)
+        if isinstance(error, ValueError) and trace is None:
+            raise error
+        return None
+
+
+class FramePack:
+    """A frame pack opened for reading.
+
+    Attributes:
+        manifest: the whole manifest.
+        frames: frame ids in time order.
+        layers: names of the image layers.
+
+    Raises:
+        DataError: missing, truncated, another format version, or without a required key.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        try:
+            self._archive = zipfile.ZipFile(self.path)
+            self.manifest: dict[str, Any] = json.loads(self._archive.read(_MANIFEST))
+        except FileNotFoundError as error:
+            raise DataError.of(path, expected="a frame pack (.zip)", found="no such file") from error
+        except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+            raise DataError.of(path, expected="a frame pack (.zip)", found=f"a damaged file ({error})") from error
+        if self.manifest.get("format") != FORMAT:
+            found = self.manifest.get("format")
+            raise DataError.of(path, "format", expected=FORMAT, found=found, fix="make it again with this version")
+        for key in _REQUIRED:
+            if key not in self.manifest:
+                raise DataError.of(path, key, expected="this key in manifest.json", found="none")
+        self.frames: list[str] = list(self.manifest["frames"])
+        self.layers: list[str] = list(self.manifest["layers"])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._archive.close()
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._archive.close()
+
+    def read(self, layer: str, frame: str) -> np.ndarray:
+        """Decodes one image to uint8 `[H, W]` or `[H, W, 3]`."""
+        name = f"{layer}/{frame}.png"
+        try:
+            encoded = self._archive.read(name)
+        except KeyError as error:
+            raise DataError.of(self.path, name, expected="this image", found="none of that name") from error
+        except (zipfile.BadZipFile, OSError, EOFError) as error:
+            raise DataError.of(self.path, name, expected="a whole image", found=f"damage ({error})") from error
+        return decode_image(encoded, f"{self.path}: {name}")
+
+    def intrinsics(self, frame: str) -> np.ndarray:
+        """Camera matrix of one frame, float64 `[3, 3]` [px], of the images in this pack."""
+        per_frame = self.manifest.get("K_per_frame")
+        if per_frame is not None:
+            return np.array(per_frame[frame], dtype=np.float64)
+        return np.array(self.manifest["K"], dtype=np.float64)
+
+    @property
+    def cam_from_world(self) -> np.ndarray:
+        """World-to-camera transform, float64 `[4, 4]`, translation in [m]."""
+        return np.array(self.manifest["cam_from_world"], dtype=np.float64)
+
+    def split(self, name: str) -> list[str]:
+        """Frame ids of the split `train` or `test`, in time order."""
+        split = self.manifest.get("split", {})
+        return [frame for frame in self.frames if split.get(frame, "train") == name]

