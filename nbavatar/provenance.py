@@ -120,12 +120,17 @@ def _git() -> dict[str, Any] | None:
     if not (_ROOT.parent / ".git").exists():
         return None
     try:
-        run = functools.partial(subprocess.run, cwd=_ROOT.parent, capture_output=True, text=True, timeout=10, check=True)
-        commit = run(["git", "rev-parse", "HEAD"]).stdout.strip()
-        dirty = bool(run(["git", "status", "--porcelain", "--untracked-files=no"]).stdout.strip())
+        commit = _run_git("rev-parse", "HEAD")
+        dirty = bool(_run_git("status", "--porcelain", "--untracked-files=no"))
     except (OSError, subprocess.SubprocessError):
         return None
     return {"commit": commit, "dirty": dirty}
+
+
+def _run_git(*words: str) -> str:
+    return subprocess.run(
+        ["git", *words], cwd=_ROOT.parent, capture_output=True, text=True, timeout=10, check=True
+    ).stdout.strip()
 
 
 @functools.cache
@@ -160,7 +165,6 @@ def _normalised(module: str) -> str:
     tree = _tree(module)
     for node in ast.walk(tree):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
-            first = node.body[0] if node.body else None
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str):
+            if ast.get_docstring(node, clean=False) is not None:
                 node.body = node.body[1:]
     return ast.dump(tree, annotate_fields=False, include_attributes=False)
