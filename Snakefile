@@ -1,0 +1,36 @@
+# The only entry: `snakemake` plans and runs what config/paper.yaml (or --configfile) describes.
+# What depends on what is in workflow/rules; what is computed is in the Python package.
+
+from snakemake.utils import min_version
+
+min_version("9.20")
+
+# A configuration given on the command line replaces the paper's as a whole; nothing is merged under it.
+if "run" not in config:
+
+    configfile: "config/paper.yaml"
+
+
+report: "workflow/report/workflow.rst"
+
+
+container: "docker://docker.io/library/nbavatar:0.1.0"
+
+
+include: "workflow/rules/common.smk"
+
+
+# `all` comes first, so that it is what `snakemake` without a target makes.
+rule all:
+    input:
+        EVERYTHING,
+    default_target: True
+
+
+include: "workflow/rules/ingest.smk"
+include: "workflow/rules/masks.smk"
+include: "workflow/rules/geometry.smk"
+include: "workflow/rules/train.smk"
+include: "workflow/rules/evaluate.smk"
+include: "workflow/rules/tables.smk"
+include: "workflow/rules/targets.smk"

@@ -1,0 +1,110 @@
+"""A whole run: its name, data, stages, variants, protocols. What `config/*.yaml` files hold.
+
+Every value has the paper's setting as its default, so a configuration file lists only what differs.
+"""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from nbavatar.config.avatar import RenderConfig, SpeedConfig, TrainConfig
+from nbavatar.config.core import from_mapping, merge, option, to_mapping
+from nbavatar.config.evaluation import EvaluateConfig, ProtocolConfig, ReportConfig, TableConfig
+from nbavatar.config.geometry import DeformConfig, FitConfig, SpectralConfig
+from nbavatar.config.preprocess import CropConfig, IngestConfig, MasksConfig, TracksConfig
+from nbavatar.config.synthetic import SynthesizeConfig
+from nbavatar.errors import ConfigError, did_you_mean
+
+__all__ = ["RunConfig", "Stages", "Variant", "load_run", "stage_options"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stages:
+    """Options of every stage."""
+
+    synthesize: SynthesizeConfig = option(SynthesizeConfig, "Synthetic dataset (used where `synthetic` is true).")
+    ingest: IngestConfig = option(IngestConfig, "Reading of videos or image folders.")
+    tracks: TracksConfig = option(TracksConfig, "Reading of parameters, keypoints and meshes.")
+    masks: MasksConfig = option(MasksConfig, "Head and hand masks.")
+    fit: FitConfig = option(FitConfig, "Multi-view refit.")
+    spectral: SpectralConfig = option(SpectralConfig, "Spectral coordinates.")
+    deform: DeformConfig = option(DeformConfig, "Contact deformation.")
+    train: TrainConfig = option(TrainConfig, "Training.")
+    render: RenderConfig = option(RenderConfig, "Rendering.")
+    evaluate: EvaluateConfig = option(EvaluateConfig, "Metrics.")
+    speed: SpeedConfig = option(SpeedConfig, "Timing.")
+    table: TableConfig = option(TableConfig, "Tables.")
+    report: ReportConfig = option(ReportConfig, "HTML report.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One way to train an avatar: which crops, which meshes, and what differs from `stages`."""
+
+    crop: str = option("center", "Name of the crop (see `crops`) whose frames it is trained on.")
+    meshes: str = option(
+        "deform", "Meshes that carry it: with contact deformation, as refitted, or as delivered.",
+        choices=("deform", "fit", "tracks"),
+    )  # fmt: skip
+    stages: dict[str, Any] = option({}, "Options that differ from the run's `stages`, by stage.")
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """Everything that one configuration file says."""
+
+    run: str = option("paper", "Name of the run; its files live in results/<run>, logs/<run>, benchmarks/<run>.")
+    layout: str = option("decaf", "Layout of the input data.", choices=("decaf", "capture"))
+    data_root: str = option("resources/DecafDataset", "Folder of the dataset, or of one capture, or of captures.")
+    synthetic: bool = option(False, "Make the dataset at `data_root` with `nbavatar synthesize` first.")
+    subjects: str = option("config/subjects.tsv", "Sheet of subjects and cameras; not used by the capture layout.")
+    test_camera: str = option("", "Capture layout: camera to hold out; empty for the most central one.")
+    runs: str = option("config/runs.tsv", "Sheet of what to make: subject, variant, protocol.")
+    tables: str = option("config/tables.yaml", "Layout of the tables.")
+    reported: str = option("config/reported.csv", "Numbers printed in the paper.")
+    device: str = option("auto", "Device of training, rendering and timing.", choices=("auto", "cpu", "cuda"))
+    size_label: str = option(
+        "", "What is said in every table caption when sizes are not the paper's, such as 'smoke size, 64 px'."
+    )
+    stages: Stages = option(Stages, "Options of every stage.")
+    crops: dict[str, CropConfig] = option(
+        {"center": CropConfig(kind="center", size=1024), "box": CropConfig(kind="box", size=512)},
+        "Crops by name: the paper's 1024 protocol uses `center`, its 512 protocol `box`.",
+    )
+    protocols: dict[str, ProtocolConfig] = option({}, "Evaluation protocols by name.")
+    variants: dict[str, Variant] = option({}, "Variants by name.")
+
+
+def load_run(mapping: Mapping[str, Any], where: str = "config") -> RunConfig:
+    """Reads and checks a whole run's configuration.
+
+    Raises:
+        ConfigError: an unknown key, a wrong type, a value out of range, a crop or stage that does not exist.
+    """
+    run = from_mapping(RunConfig, mapping, where)
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", run.run):
+        raise ConfigError.of(f"{where}.run", expected="letters, digits, '_' and '-'", found=repr(run.run))
+    for name, crop in [(f"variants.{n}", v.crop) for n, v in run.variants.items()] + [
+        (f"protocols.{n}", p.crop) for n, p in run.protocols.items()
+    ]:
+        if crop not in run.crops:
+            raise ConfigError(f"{where}.{name}.crop: unknown crop '{crop}'; {did_you_mean(crop, run.crops)}")
+    stages = {field.name for field in dataclasses.fields(Stages)}
+    for name, variant in run.variants.items():
+        for stage in variant.stages:
+            if stage not in stages:
+                raise ConfigError(f"{where}.variants.{name}: unknown stage '{stage}'; {did_you_mean(stage, stages)}")
+            _resolved(run, stage, name)
+    return run
+
+
+def stage_options(run: RunConfig, stage: str, variant: str | None = None) -> dict[str, Any]:
+    """The resolved options of one stage, all keys present, JSON-ready."""
+    return to_mapping(_resolved(run, stage, variant))
+
+
+def _resolved(run: RunConfig, stage: str, variant: str | None) -> Any:
+    base = getattr(run.stages, stage)
+    over = run.variants[variant].stages.get(stage, {}) if variant is not None else {}
+    return from_mapping(type(base), merge(to_mapping(base), over), f"variants.{variant}.stages.{stage}")

@@ -1,0 +1,147 @@
+"""The tab-separated sheets of a run: who is there, and what is to be made.
+
+Camera and subject ids are text, always: in YAML `084` is text, `110` a number and `010` eight.
+"""
+
+import csv
+import dataclasses
+import math
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from nbavatar.errors import ConfigError, did_you_mean
+
+__all__ = ["Row", "Subject", "capture_subjects", "read_rows", "read_subjects"]
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """One subject: id, cameras it is trained on, camera it is judged on, folder of its data."""
+
+    name: str
+    train_cameras: tuple[str, ...]
+    test_camera: str
+    root: str
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """All cameras, sorted."""
+        return tuple(sorted((*self.train_cameras, self.test_camera)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One number to produce: a subject's avatar of one variant, judged under one protocol."""
+
+    subject: str
+    variant: str
+    protocol: str
+
+
+def read_subjects(path: str | os.PathLike[str], root: str) -> dict[str, Subject]:
+    """Reads `subject, train_cameras (comma-separated), test_camera`.
+
+    Raises:
+        ConfigError: a missing column, a malformed or repeated id, a test camera among the training cameras.
+    """
+    subjects: dict[str, Subject] = {}
+    for line, row in _read(path, ("subject", "train_cameras", "test_camera")):
+        where = f"{path}, line {line}"
+        train = tuple(part.strip() for part in row["train_cameras"].split(",") if part.strip())
+        subject = Subject(row["subject"], train, row["test_camera"], root)
+        for name in (subject.name, *subject.cameras):
+            if not _NAME.fullmatch(name):
+                raise ConfigError.of(where, expected="ids of letters, digits, '_', '-' and '.'", found=repr(name))
+        if subject.name in subjects:
+            raise ConfigError.of(where, "subject", expected="each subject once", found=f"{subject.name} again")
+        if not train or len(set(subject.cameras)) != len(subject.cameras):
+            raise ConfigError.of(
+                where, "train_cameras", expected="one or more cameras, each once and without the test camera",
+                found=row["train_cameras"] or "none",
+            )  # fmt: skip
+        subjects[subject.name] = subject
+    return subjects
+
+
+def capture_subjects(root: str, test_camera: str) -> dict[str, Subject]:
+    """Finds captures: `root` itself if it holds `cameras.json`, else its sub-folders that do.
+
+    Args:
+        root: folder of one capture, or of several.
+        test_camera: camera to hold out; empty for the most central one, whose centre is nearest to the mean of
+            all centres, so that the judged view lies between the training views.
+    """
+    import json
+
+    base = Path(root)
+    folders = [base] if (base / "cameras.json").is_file() else sorted(base.glob("*/cameras.json"))
+    folders = [folder.parent if folder.name == "cameras.json" else folder for folder in folders]
+    if not folders:
+        raise ConfigError.of(
+            "data_root", expected="a capture (a folder with cameras.json), or a folder of captures",
+            found=f"{base} without any" if base.is_dir() else f"{base}, which does not exist",
+            fix="name it with --config data_root=/path/to/capture",
+        )  # fmt: skip
+    subjects = {}
+    for folder in folders:
+        path = folder / "cameras.json"
+        try:
+            cameras = json.loads(path.read_text(encoding="utf-8"))
+            centres = {name: _centre(camera["R"], camera["t"]) for name, camera in cameras.items()}
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+            raise ConfigError.of(path, expected="camera name -> width, height, K, R, t", found=repr(error)) from error
+        if len(centres) < 2:
+            raise ConfigError.of(path, expected="two cameras or more", found=len(centres))
+        mean = [sum(axis) / len(centres) for axis in zip(*centres.values(), strict=True)]
+        held_out = test_camera or min(sorted(centres), key=lambda name: math.dist(centres[name], mean))
+        if held_out not in centres:
+            raise ConfigError(f"test_camera: unknown camera '{held_out}'; {did_you_mean(held_out, centres)}")
+        train = tuple(sorted(set(centres) - {held_out}))
+        name = re.sub(r"[^A-Za-z0-9_.-]", "_", folder.resolve().name)
+        subjects[name] = Subject(name, train, held_out, str(folder))
+    return subjects
+
+
+def read_rows(path: str | os.PathLike[str], subjects: Sequence[str]) -> list[Row]:
+    """Reads `subject, variant, protocol`; subject `*` stands for every subject.
+
+    Raises:
+        ConfigError: an unknown subject, a repeated row.
+    """
+    rows: list[Row] = []
+    for line, row in _read(path, ("subject", "variant", "protocol")):
+        if row["subject"] != "*" and row["subject"] not in subjects:
+            where = f"{path}, line {line}"
+            raise ConfigError(f"{where}: unknown subject '{row['subject']}'; {did_you_mean(row['subject'], subjects)}")
+        for subject in subjects if row["subject"] == "*" else [row["subject"]]:
+            new = Row(subject, row["variant"], row["protocol"])
+            if new in rows:
+                raise ConfigError.of(f"{path}, line {line}", expected="each row once", found=f"{new} again")
+            rows.append(new)
+    return rows
+
+
+def _read(path: str | os.PathLike[str], columns: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
+    try:
+        with open(path, newline="", encoding="utf-8") as stream:
+            lines = [line for line in stream if not line.startswith("#")]
+    except FileNotFoundError as error:
+        raise ConfigError.of(path, expected="a sheet (.tsv)", found="no such file") from error
+    reader = csv.DictReader(lines, delimiter="\t")
+    if list(reader.fieldnames or ()) != list(columns):
+        found = ", ".join(reader.fieldnames or ()) or "nothing"
+        raise ConfigError.of(path, "header", expected=f"tab-separated {', '.join(columns)}", found=found)
+    result = []
+    for number, row in enumerate(reader, start=2):
+        if None in row or any(value is None for value in row.values()):
+            raise ConfigError.of(f"{path}, line {number}", expected=f"{len(columns)} columns", found="another number")
+        result.append((number, {key: value.strip() for key, value in row.items()}))
+    return result
+
+
+def _centre(rotation: Sequence[Sequence[float]], translation: Sequence[float]) -> list[float]:
+    return [-sum(rotation[row][axis] * translation[row] for row in range(3)) for axis in range(3)]

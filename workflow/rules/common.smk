@@ -1,0 +1,196 @@
+"""Sheets, checks, and the functions that rules share. Nothing here computes, and nothing imports torch."""
+
+import json
+import sys
+from pathlib import Path
+
+from snakemake.exceptions import WorkflowError
+
+from nbavatar.config.run import load_run, stage_options
+from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
+from nbavatar.config.tables import read_tables
+from nbavatar.errors import NBAvatarError, did_you_mean
+from nbavatar.provenance import code_digest
+
+try:
+    RUN = load_run(config)
+    if RUN.layout == "capture":
+        SUBJECTS = capture_subjects(RUN.data_root, RUN.test_camera)
+    else:
+        SUBJECTS = read_subjects(RUN.subjects, RUN.data_root)
+    ROWS = read_rows(RUN.runs, list(SUBJECTS))
+    for row in ROWS:
+        for kind, name, known in (
+            ("variant", row.variant, RUN.variants),
+            ("protocol", row.protocol, RUN.protocols),
+        ):
+            if name not in known:
+                raise NBAvatarError(f"{RUN.runs}: unknown {kind} '{name}'; {did_you_mean(name, known)}")
+    TABLES = read_tables(RUN.tables)
+except NBAvatarError as error:
+    raise WorkflowError(str(error)) from None
+
+R = f"results/{RUN.run}"
+
+
+wildcard_constraints:
+    run=RUN.run,
+    subject="|".join(SUBJECTS),
+    camera="|".join(sorted({c for s in SUBJECTS.values() for c in s.cameras})),
+    crop="|".join(RUN.crops),
+    variant="|".join(RUN.variants),
+    protocol="|".join(RUN.protocols),
+    table="|".join(TABLES),
+
+
+def options(stage):
+    """The resolved options of a stage, as the JSON text that reaches its command and triggers re-runs."""
+
+    def resolve(wildcards):
+        variant = getattr(wildcards, "variant", None)
+        return json.dumps(stage_options(RUN, stage, variant), sort_keys=True)
+
+    return resolve
+
+
+def crop_options(wildcards):
+    from nbavatar.config.core import to_mapping
+
+    return json.dumps(to_mapping(RUN.crops[wildcards.crop]), sort_keys=True)
+
+
+def protocol_options(wildcards):
+    from nbavatar.config.core import to_mapping
+
+    return json.dumps({"name": wildcards.protocol} | to_mapping(RUN.protocols[wildcards.protocol]), sort_keys=True)
+
+
+def root(wildcards):
+    return SUBJECTS[wildcards.subject].root
+
+
+def split_folder(subject):
+    """`train` or `test`: Decaf splits its release by subject."""
+    base = Path(SUBJECTS[subject].root)
+    found = [name for name in ("train", "test") if (base / name / "params" / subject).is_dir()]
+    return base / (found[0] if found else {"S1": "test", "S3": "test", "S6": "test"}.get(subject, "train"))
+
+
+def raw_files(wildcards):
+    """Files of the dataset that one camera's frames come from."""
+    subject, camera = wildcards.subject, wildcards.camera
+    if RUN.layout == "capture":
+        base = Path(SUBJECTS[subject].root)
+        return [base / "cameras.json", base / "splits.json", base / "images" / camera]
+    base = split_folder(subject)
+    return [
+        base / "videos" / subject / f"{camera}.mp4",
+        base / "segmentations" / subject / f"{camera}.mp4",
+        base / "cameras" / subject / "cameras.pkl",
+        base / "cutIDs" / f"{subject}.pkl",
+    ]
+
+
+def raw_tracks(wildcards):
+    """Files of the dataset that a subject's parameters and meshes come from."""
+    subject = wildcards.subject
+    if RUN.layout == "capture":
+        base = Path(SUBJECTS[subject].root)
+        return [base / "cameras.json", base / "splits.json", base / "meshes"]
+    base = split_folder(subject)
+    cameras = SUBJECTS[subject].cameras
+    keyed = ("head_keys", "right_hand_keys", "head_bbs", "right_hand_bbs")
+    return [
+        base / "params" / subject / "params_smoothed.pkl",
+        base / "cameras" / subject / "cameras.pkl",
+        base / "cutIDs" / f"{subject}.pkl",
+        base / "deformations" / subject / "deforms.npy",
+        base / "contacts" / subject / "contacts_head.npy",
+        base / "contacts" / subject / "contacts_rh.npy",
+        *(base / name / subject / f"{camera}.npy" for name in keyed for camera in cameras),
+        *assets(),
+    ]
+
+
+def assets():
+    """Body models, supplied by the user."""
+    base = Path(RUN.data_root) / "assets"
+    return [
+        base / "generic_model.pkl",
+        base / "landmark_embedding.npy",
+        base / "mano_v1_2" / "models" / "MANO_RIGHT.pkl",
+    ]
+
+
+def crops_of(wildcards, variant, crop=None, cameras=None):
+    crop = crop or RUN.variants[variant].crop
+    subject = SUBJECTS[wildcards.subject]
+    cameras = subject.train_cameras if cameras is None else cameras
+    return [f"{R}/crop/{crop}/{subject.name}/{camera}.zip" for camera in cameras]
+
+
+def train_frames(wildcards):
+    """Crops of the training cameras."""
+    return crops_of(wildcards, wildcards.variant)
+
+
+def meshes_of(wildcards):
+    """The meshes that carry a variant."""
+    stage = RUN.variants[wildcards.variant].meshes
+    if RUN.layout == "capture" and (stage == "fit" or RUN.stages.tracks.contact == "given"):
+        stage = "tracks"
+    return f"{R}/{stage}/{wildcards.subject}.npz"
+
+
+def fitted(wildcards):
+    """Meshes before contact: refitted ones, or those that a capture brings."""
+    stage = "tracks" if RUN.layout == "capture" else "fit"
+    return f"{R}/{stage}/{wildcards.subject}.npz"
+
+
+def protocol_frames(wildcards):
+    """Crops that a protocol looks at: the held-out camera for novel views, the training cameras for held-out poses."""
+    protocol = RUN.protocols[wildcards.protocol]
+    subject = SUBJECTS[wildcards.subject]
+    cameras = [subject.test_camera] if protocol.split == "novel_view" else subject.train_cameras
+    return crops_of(wildcards, wildcards.variant, protocol.crop, cameras)
+
+
+def protocol_train_frames(wildcards):
+    """Training crops of the same kind: the mean training image is one of the trivial answers."""
+    return crops_of(wildcards, wildcards.variant, RUN.protocols[wildcards.protocol].crop)
+
+
+def evals_of(rows):
+    return [f"{R}/eval/{row.subject}/{row.variant}/{row.protocol}.json" for row in rows]
+
+
+def renders_of(rows):
+    return [f"{R}/render/{row.subject}/{row.variant}/{row.protocol}.zip" for row in rows]
+
+
+def avatars():
+    """(subject, variant) of every avatar, in the order of the sheet."""
+    return list(dict.fromkeys((row.subject, row.variant) for row in ROWS))
+
+
+def rows_of(table):
+    """The rows of the sheet that a table shows."""
+    variants, protocols = TABLES[table].variants, TABLES[table].protocols
+    return [row for row in ROWS if row.variant in variants and row.protocol in protocols]
+
+
+def speeds_of(table):
+    """Timings that a table shows: of the first subject that has the variant."""
+    first = {}
+    for subject, variant in avatars():
+        if variant in TABLES[table].speeds:
+            first.setdefault(variant, subject)
+    return [f"{R}/speed/{subject}/{variant}.json" for variant, subject in first.items()]
+
+
+EVERYTHING = [
+    *evals_of(ROWS),
+    *(f"{R}/tables/{table}.{suffix}" for table in TABLES for suffix in ("csv", "md", "tex")),
+    f"{R}/report/index.html",
+]

@@ -1,0 +1,80 @@
+"""Renders, metrics, timing. Rendering and judging are apart: metrics are recomputed without a GPU, and disputed
+without training again.
+
+REQUIRED INPUTS: results/{run}/train/{subject}/{variant}/model.pt, crops, meshes
+OUTPUTS: results/{run}/render/..., results/{run}/eval/..., results/{run}/speed/...
+"""
+
+
+rule render:
+    input:
+        model="results/{run}/train/{subject}/{variant}/model.pt",
+        meshes=meshes_of,
+        frames=protocol_frames,
+    output:
+        "results/{run}/render/{subject}/{variant}/{protocol}.zip",
+    log:
+        "logs/{run}/render/{subject}/{variant}/{protocol}.log",
+    benchmark:
+        "benchmarks/{run}/render/{subject}/{variant}/{protocol}.jsonl"
+    threads: 4
+    resources:
+        gpu=1,
+        mem="16GB",
+        runtime="4h",
+    params:
+        device=RUN.device,
+        protocol=protocol_options,
+        cfg=options("render"),
+        code=code_digest("render"),
+    shell:
+        "nbavatar render --model {input.model} --meshes {input.meshes} --frames {input.frames}"
+        " --protocol {params.protocol:q} --out {output} --device {params.device} --cfg {params.cfg:q} > {log} 2>&1"
+
+
+rule evaluate:
+    input:
+        render="results/{run}/render/{subject}/{variant}/{protocol}.zip",
+        frames=protocol_frames,
+        train=protocol_train_frames,
+    output:
+        record="results/{run}/eval/{subject}/{variant}/{protocol}.json",
+        images="results/{run}/eval/{subject}/{variant}/{protocol}.csv",
+    log:
+        "logs/{run}/eval/{subject}/{variant}/{protocol}.log",
+    threads: 2
+    resources:
+        mem="16GB",
+        runtime="8h",
+    params:
+        protocol=protocol_options,
+        cfg=options("evaluate"),
+        code=code_digest("evaluate"),
+    shell:
+        "nbavatar evaluate --render {input.render} --frames {input.frames} --train-frames {input.train}"
+        " --protocol {params.protocol:q} --out {output.record} --csv {output.images}"
+        " --cfg {params.cfg:q} > {log} 2>&1"
+
+
+# Timing wants the device for itself: it takes every GPU that the profile grants, and every core of a small machine.
+rule speed:
+    input:
+        model="results/{run}/train/{subject}/{variant}/model.pt",
+        meshes=meshes_of,
+        frames=train_frames,
+    output:
+        "results/{run}/speed/{subject}/{variant}.json",
+    log:
+        "logs/{run}/speed/{subject}/{variant}.log",
+    threads: workflow.cores
+    resources:
+        gpu=workflow.global_resources.get("gpu", 1),
+        mem="16GB",
+        runtime="30m",
+    params:
+        device=RUN.device,
+        cfg=options("speed"),
+        code=code_digest("speed"),
+    shell:
+        "nbavatar speed --model {input.model} --meshes {input.meshes} --frames {input.frames[0]}"
+        " --out {output} --device {params.device} --cfg {params.cfg:q} > {log} 2>&1"

@@ -1,0 +1,75 @@
+"""Refit, spectral coordinates, contact deformation.
+
+REQUIRED INPUTS: results/{run}/tracks/{subject}.npz, results/{run}/ingest/{subject}/*.zip
+OUTPUTS: results/{run}/fit/{subject}.{npz,png}, results/{run}/spectral/{subject}.npz,
+         results/{run}/deform/{subject}.{npz,exr.zip}
+"""
+
+# A capture brings final meshes: there is nothing to refit.
+if RUN.layout == "decaf":
+
+    rule fit:
+        input:
+            tracks="results/{run}/tracks/{subject}.npz",
+            frames=lambda w: [f"{R}/ingest/{w.subject}/{c}.zip" for c in SUBJECTS[w.subject].train_cameras],
+            assets=assets(),
+        output:
+            meshes="results/{run}/fit/{subject}.npz",
+            sheet=report("results/{run}/fit/{subject}.png", category="Geometry", caption="../report/fit.rst"),
+        log:
+            "logs/{run}/fit/{subject}.log",
+        benchmark:
+            "benchmarks/{run}/fit/{subject}.jsonl"
+        threads: 4
+        resources:
+            mem="16GB",
+            runtime="8h",
+        params:
+            assets=Path(RUN.data_root) / "assets",
+            cfg=options("fit"),
+            code=code_digest("fit"),
+        shell:
+            "nbavatar fit --tracks {input.tracks} --assets {params.assets:q} --frames {input.frames}"
+            " --out {output.meshes} --sheet {output.sheet} --cfg {params.cfg:q} > {log} 2>&1"
+
+
+rule spectral:
+    input:
+        fitted,
+    output:
+        meshes="results/{run}/spectral/{subject}.npz",
+        picture=report("results/{run}/spectral/{subject}.png", category="Geometry", caption="../report/spectral.rst"),
+    log:
+        "logs/{run}/spectral/{subject}.log",
+    resources:
+        mem="4GB",
+        runtime="30m",
+    params:
+        cfg=options("spectral"),
+        code=code_digest("spectral"),
+    shell:
+        "nbavatar spectral --meshes {input} --out {output.meshes} --picture {output.picture}"
+        " --cfg {params.cfg:q} > {log} 2>&1"
+
+
+rule deform:
+    input:
+        fitted,
+    output:
+        meshes="results/{run}/deform/{subject}.npz",
+        maps="results/{run}/deform/{subject}.exr.zip",
+        picture=report("results/{run}/deform/{subject}.png", category="Geometry", caption="../report/deform.rst"),
+    log:
+        "logs/{run}/deform/{subject}.log",
+    benchmark:
+        "benchmarks/{run}/deform/{subject}.jsonl"
+    threads: 4
+    resources:
+        mem="8GB",
+        runtime="4h",
+    params:
+        cfg=options("deform"),
+        code=code_digest("deform"),
+    shell:
+        "nbavatar deform --meshes {input} --out {output.meshes} --exr {output.maps} --validate {output.picture}"
+        " --cfg {params.cfg:q} > {log} 2>&1"

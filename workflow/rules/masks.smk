@@ -1,0 +1,44 @@
+"""Frame packs + meshes -> head and hand masks, then crops with their intrinsics.
+
+REQUIRED INPUTS: results/{run}/ingest/{subject}/{camera}.zip, results/{run}/tracks/{subject}.npz
+OUTPUTS: results/{run}/masks/{subject}/{camera}.zip, results/{run}/crop/{crop}/{subject}/{camera}.zip
+"""
+
+
+rule masks:
+    input:
+        frames="results/{run}/ingest/{subject}/{camera}.zip",
+        meshes="results/{run}/tracks/{subject}.npz",
+    output:
+        "results/{run}/masks/{subject}/{camera}.zip",
+    log:
+        "logs/{run}/masks/{subject}/{camera}.log",
+    resources:
+        mem="8GB",
+        runtime="4h",
+    params:
+        cfg=options("masks"),
+        code=code_digest("masks"),
+    shell:
+        "nbavatar masks --frames {input.frames} --meshes {input.meshes} --out {output}"
+        " --cfg {params.cfg:q} > {log} 2>&1"
+
+
+rule crop:
+    input:
+        frames="results/{run}/ingest/{subject}/{camera}.zip",
+        masks="results/{run}/masks/{subject}/{camera}.zip",
+        meshes="results/{run}/tracks/{subject}.npz",
+    output:
+        "results/{run}/crop/{crop}/{subject}/{camera}.zip",
+    log:
+        "logs/{run}/crop/{crop}/{subject}/{camera}.log",
+    resources:
+        mem="4GB",
+        runtime="2h",
+    params:
+        cfg=crop_options,
+        code=code_digest("crop"),
+    shell:
+        "nbavatar crop --frames {input.frames} --masks {input.masks} --meshes {input.meshes} --out {output}"
+        " --cfg {params.cfg:q} > {log} 2>&1"

@@ -1,0 +1,61 @@
+"""Names to ask for parts of the work: `snakemake subject_S2`, `snakemake table_ablation`, `snakemake stage_fit`."""
+
+
+def stage_files(stage):
+    """Every file of one stage that the whole run needs."""
+    subjects = list(dict.fromkeys(row.subject for row in ROWS))
+    cameras = [(s, c) for s in subjects for c in SUBJECTS[s].cameras]
+    files = {
+        "ingest": [f"{R}/ingest/{s}/{c}.zip" for s, c in cameras],
+        "tracks": [f"{R}/tracks/{s}.npz" for s in subjects],
+        "masks": [f"{R}/masks/{s}/{c}.zip" for s, c in cameras],
+        "crop": [f"{R}/crop/{crop}/{s}/{c}.zip" for crop in RUN.crops for s, c in cameras],
+        "spectral": [f"{R}/spectral/{s}.npz" for s in subjects],
+        "deform": [f"{R}/deform/{s}.npz" for s in subjects],
+        "train": [f"{R}/train/{s}/{v}/model.pt" for s, v in avatars()],
+        "render": renders_of(ROWS),
+        "evaluate": evals_of(ROWS),
+        "speed": [f"{R}/speed/{s}/{v}.json" for s, v in avatars()],
+    }
+    if RUN.layout == "decaf":
+        files["fit"] = [f"{R}/fit/{s}.npz" for s in subjects]
+    return files[stage]
+
+
+for _subject in SUBJECTS:
+
+    rule:
+        name:
+            f"subject_{_subject}"
+        input:
+            evals_of([row for row in ROWS if row.subject == _subject]),
+
+
+for _table in TABLES:
+
+    rule:
+        name:
+            f"table_{_table}"
+        input:
+            [f"{R}/tables/{_table}.{suffix}" for suffix in ("csv", "md", "tex")],
+
+
+for _stage in (
+    "ingest",
+    "tracks",
+    "masks",
+    "crop",
+    *(["fit"] if RUN.layout == "decaf" else []),
+    "spectral",
+    "deform",
+    "train",
+    "render",
+    "evaluate",
+    "speed",
+):
+
+    rule:
+        name:
+            f"stage_{_stage}"
+        input:
+            stage_files(_stage),
