@@ -1,0 +1,279 @@
+"""Captures of one's own: the second input layout (bring your own data).
+
+    cameras.json                       camera -> width, height, K, R, t (world-to-camera, OpenCV) [, distortion]
+    images/<camera>/<frame>.<type>     jpg, png or webp
+    masks/<camera>/<frame>.png         0 background, 1 head, 2 right hand, 3 left hand; or 0 and 255 for the person
+    alpha/<camera>/<frame>.png         optional coverage, 8 bit
+    meshes/topology.npz                head_faces, right_hand_faces, left_hand_faces: any subset [, <part>_rest]
+    meshes/<frame>.npz                 head, right_hand, left_hand [m]; optional head_rigid, the head without contact
+    splits.json                        frames [, train, test, cuts]
+
+Lengths are metres, world axes any, pixel centres at +0.5. Every reader raises `DataError` with one line.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nbavatar.camera.distortion import checked_coefficients
+from nbavatar.camera.pinhole import Camera
+from nbavatar.data.sequences import PARTS
+from nbavatar.errors import DataError, did_you_mean
+from nbavatar.io.arrays import read_arrays
+from nbavatar.io.images import decode_image
+from nbavatar.io.records import read_json
+
+__all__ = [
+    "Capture",
+    "Splits",
+    "find_image",
+    "open_capture",
+    "read_coverage",
+    "read_mask",
+    "read_mesh",
+    "read_rgb",
+    "read_splits",
+    "read_topology",
+]
+
+_TYPES = (".jpg", ".jpeg", ".png", ".webp")
+
+
+@dataclasses.dataclass(frozen=True)
+class Capture:
+    """A capture whose cameras are known.
+
+    Attributes:
+        root: its folder.
+        cameras: calibrated cameras by name.
+    """
+
+    root: Path
+    cameras: dict[str, Camera]
+
+    def camera(self, name: str) -> Camera:
+        """The camera of this name, or one line that lists those there are."""
+        if name not in self.cameras:
+            raise DataError(f"{self.root / 'cameras.json'}: no camera '{name}'; {did_you_mean(name, self.cameras)}")
+        return self.cameras[name]
+
+
+@dataclasses.dataclass(frozen=True)
+class Splits:
+    """Frames in time order, the user's split if there is one, and cuts.
+
+    Attributes:
+        frames: ids.
+        test: ids held out; empty where the user leaves the choice to us.
+        cuts: pairs (last id before, first id after).
+    """
+
+    frames: list[str]
+    test: list[str]
+    cuts: list[tuple[str, str]]
+
+
+def open_capture(root: str | Path, *, pixel_center: float = 0.5) -> Capture:
+    """Reads `cameras.json`.
+
+    Args:
+        root: folder of the capture.
+        pixel_center: where the stored matrices put the centre of pixel (0, 0) [px]; the result has it at 0.5.
+    """
+    root = Path(root)
+    path = root / "cameras.json"
+    stored = read_json(path)
+    if not isinstance(stored, Mapping) or not stored:
+        raise DataError.of(path, expected="a mapping from camera name to its calibration", found=type(stored).__name__)
+    return Capture(root, {str(name): _camera(str(name), entry, path, pixel_center) for name, entry in stored.items()})
+
+
+def read_splits(root: Path) -> Splits:
+    """Reads `splits.json`; a `train` list leaves out frames that are in neither list."""
+    path = root / "splits.json"
+    stored = read_json(path)
+    if not isinstance(stored, Mapping):
+        raise DataError.of(path, expected="a mapping with frames", found=type(stored).__name__)
+    frames = _ids(stored, "frames", path)
+    if not frames:
+        raise DataError.of(path, "frames", expected="at least one frame id", found="none")
+    train, test = _ids(stored, "train", path), _ids(stored, "test", path)
+    for name, ids in (("train", train), ("test", test)):
+        unknown = sorted(set(ids) - set(frames))
+        if unknown:
+            raise DataError.of(path, name, expected="ids that are in frames", found=f"'{unknown[0]}', which is not")
+    both = sorted(set(train) & set(test))
+    if both:
+        raise DataError.of(path, "test", expected="frames that are not in train", found=f"'{both[0]}', which is in both")
+    if train:
+        used = set(train) | set(test)
+        frames = [frame for frame in frames if frame in used]
+    cuts = stored.get("cuts", [])
+    if not isinstance(cuts, list) or not all(isinstance(c, list) and len(c) == 2 for c in cuts):
+        raise DataError.of(path, "cuts", expected="pairs of frame ids", found=repr(cuts)[:60])
+    return Splits(frames, test, [(str(a), str(b)) for a, b in cuts])
+
+
+def find_image(root: Path, kind: str, camera: str, frame: str) -> Path | None:
+    """Path of `<kind>/<camera>/<frame>.<type>`, or None if there is none of the known types."""
+    for suffix in _TYPES:
+        path = root / kind / camera / f"{frame}{suffix}"
+        if path.is_file():
+            return path
+    return None
+
+
+def read_rgb(capture: Capture, camera: Camera, frame: str) -> np.ndarray:
+    """Reads one image, uint8 `[H, W, 3]`, of exactly the camera's size."""
+    path = find_image(capture.root, "images", camera.name, frame)
+    if path is None:
+        wanted = capture.root / "images" / camera.name / f"{frame}.jpg"
+        raise DataError.of(wanted, expected="an image (jpg, png or webp)", found="none")
+    image = _sized(decode_image(path), path, camera)
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+
+def read_mask(capture: Capture, camera: Camera, frame: str) -> tuple[str, np.ndarray] | None:
+    """Reads one mask and tells its kind.
+
+    Returns:
+        ("label", uint8 `[H, W]` of 0..3) or ("person", uint8 `[H, W]` of 0..255), or None where there is no file.
+        A mask with a value above 3 is of the second kind.
+    """
+    path = find_image(capture.root, "masks", camera.name, frame)
+    if path is None:
+        return None
+    mask = _gray(_sized(decode_image(path), path, camera))
+    return ("label" if mask.max(initial=0) <= 3 else "person"), mask
+
+
+def read_coverage(capture: Capture, camera: Camera, frame: str) -> np.ndarray | None:
+    """Reads one alpha image, uint8 `[H, W]`, or None where there is no file."""
+    path = find_image(capture.root, "alpha", camera.name, frame)
+    return None if path is None else _gray(_sized(decode_image(path), path, camera))
+
+
+def read_topology(root: Path) -> dict[str, tuple[np.ndarray, np.ndarray | None]]:
+    """Reads faces int64 `[F, 3]` and, where stored, rest vertices float32 `[V, 3]` [m] of each part."""
+    path = root / "meshes" / "topology.npz"
+    arrays, _ = read_arrays(path)
+    parts: dict[str, tuple[np.ndarray, np.ndarray | None]] = {}
+    for part in PARTS:
+        if f"{part}_faces" not in arrays:
+            continue
+        faces, rest = arrays[f"{part}_faces"], arrays.get(f"{part}_rest")
+        if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu" or not len(faces):
+            raise DataError.of(path, f"{part}_faces", expected="whole numbers [F, 3]", found=_kind(faces))
+        if faces.min() < 0:
+            raise DataError.of(path, f"{part}_faces", expected="vertex ids from 0", found=int(faces.min()))
+        if rest is not None:
+            _check_vertices(rest, faces, path, f"{part}_rest", None)
+        parts[part] = (faces.astype(np.int64), None if rest is None else rest.astype(np.float32))
+    if not parts:
+        names = ", ".join(f"{part}_faces" for part in PARTS)
+        raise DataError.of(path, expected=f"at least one of {names}", found=f"only {', '.join(arrays) or 'nothing'}")
+    return parts
+
+
+def read_mesh(
+    root: Path, frame: str, topology: Mapping[str, tuple[np.ndarray, np.ndarray | None]]
+) -> dict[str, np.ndarray]:
+    """Reads one frame's vertices, float32 `[V, 3]` [m], of every part (and `head_rigid` where stored)."""
+    path = root / "meshes" / f"{frame}.npz"
+    arrays, _ = read_arrays(path, required=tuple(topology))
+    result = {}
+    for name in (*topology, "head_rigid"):
+        if name in arrays and (name != "head_rigid" or "head" in topology):
+            faces, rest = topology["head" if name == "head_rigid" else name]
+            _check_vertices(arrays[name], faces, path, name, None if rest is None else len(rest))
+            result[name] = arrays[name].astype(np.float32)
+    if "head_rigid" in result and result["head_rigid"].shape != result["head"].shape:
+        expected, found = f"{len(result['head'])} vertices as in head", len(result["head_rigid"])
+        raise DataError.of(path, "head_rigid", expected=expected, found=found)
+    return result
+
+
+def _camera(name: str, entry: Any, path: Path, pixel_center: float) -> Camera:
+    where = f"{path}: camera {name}"
+    if not isinstance(entry, Mapping):
+        raise DataError.of(where, expected="width, height, K, R, t", found=type(entry).__name__)
+    for key in ("width", "height", "K", "R", "t"):
+        if key not in entry:
+            raise DataError.of(where, key, expected="this key", found=f"only {', '.join(map(str, entry))}")
+    for key in ("width", "height"):
+        if not isinstance(entry[key], int) or isinstance(entry[key], bool) or entry[key] < 1:
+            raise DataError.of(where, key, expected="a whole number of pixels", found=repr(entry[key]))
+    K, R, t = (_numbers(entry[key], shape, where, key) for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))))
+    if np.abs(K[2] - [0, 0, 1]).max() > 1e-9 or K[1, 0] != 0 or K[0, 1] != 0 or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise DataError.of(where, "K", expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", found=K.tolist())
+    off = np.abs(R @ R.T - np.eye(3)).max()
+    if off > 1e-3 or np.linalg.det(R) < 0:
+        found = f"a matrix that is off by {off:.2g}, determinant {np.linalg.det(R):.3g}"
+        raise DataError.of(where, "R", expected="a rotation", found=found)
+    K[:2, 2] += 0.5 - pixel_center
+    if not (0 < K[0, 2] < entry["width"] and 0 < K[1, 2] < entry["height"]):
+        expected = f"a principal point inside {entry['width']} x {entry['height']}"
+        raise DataError.of(where, "K", expected=expected, found=f"({K[0, 2]:.1f}, {K[1, 2]:.1f})")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = R, t
+    stored = entry.get("distortion")
+    distortion = None if stored is None else checked_coefficients(stored, f"{where}: distortion")
+    return Camera(name, entry["width"], entry["height"], K, pose, distortion)
+
+
+def _numbers(value: Any, shape: Sequence[int], where: str, key: str) -> np.ndarray:
+    expected = " x ".join(map(str, shape)) + " finite numbers"
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DataError.of(where, key, expected=expected, found=repr(value)[:60]) from None
+    if key == "t" and array.shape == (3, 1):
+        array = array[:, 0]
+    if array.shape != tuple(shape) or not np.isfinite(array).all():
+        raise DataError.of(where, key, expected=expected, found=f"{list(array.shape)}: {value!r}"[:100])
+    return array
+
+
+def _ids(stored: Mapping[str, Any], key: str, path: Path) -> list[str]:
+    values = stored.get(key, [])
+    if not isinstance(values, list) or not all(isinstance(v, (str, int)) for v in values):
+        raise DataError.of(path, key, expected="a list of frame ids", found=repr(values)[:60])
+    ids = [str(v) for v in values]
+    twice = [v for i, v in enumerate(ids) if v in ids[:i]] if len(set(ids)) != len(ids) else []
+    if twice:
+        raise DataError.of(path, key, expected="each frame once", found=f"'{twice[0]}' twice")
+    odd = [v for v in ids if not v or "/" in v or v.startswith(".")]
+    if odd:
+        raise DataError.of(path, key, expected="ids that are file names without their type", found=repr(odd[0]))
+    return ids
+
+
+def _sized(image: np.ndarray, path: Path, camera: Camera) -> np.ndarray:
+    if image.shape[:2] != (camera.height, camera.width):
+        expected = f"{camera.width} x {camera.height} as in cameras.json"
+        raise DataError.of(path, "size", expected=expected, found=f"{image.shape[1]} x {image.shape[0]}")
+    return image
+
+
+def _gray(image: np.ndarray) -> np.ndarray:
+    return image if image.ndim == 2 else image[..., 0]
+
+
+def _check_vertices(verts: np.ndarray, faces: np.ndarray, path: Path, name: str, count: int | None) -> None:
+    if verts.ndim != 2 or verts.shape[1] != 3 or verts.dtype.kind not in "fiu":
+        raise DataError.of(path, name, expected="numbers [V, 3]", found=_kind(verts))
+    if count is not None and len(verts) != count:
+        raise DataError.of(path, name, expected=f"{count} vertices as in topology.npz", found=len(verts))
+    if faces.max() >= len(verts):
+        expected = f"more than {int(faces.max())} vertices, as the faces of topology.npz need"
+        raise DataError.of(path, name, expected=expected, found=len(verts))
+    if not np.isfinite(verts).all():
+        bad = int(np.flatnonzero(~np.isfinite(verts).all(axis=1))[0])
+        raise DataError.of(path, name, expected="finite coordinates", found=f"NaN or infinity at vertex {bad}")
+
+
+def _kind(array: np.ndarray) -> str:
+    return f"{array.dtype} {list(array.shape)}"
