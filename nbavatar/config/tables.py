@@ -1,0 +1,117 @@
+"""Layout of the tables: which rows and columns, and where each number comes from. What `config/tables.yaml` holds."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+from nbavatar.config.core import from_mapping, option
+from nbavatar.errors import ConfigError, did_you_mean
+
+__all__ = ["Panel", "TableLayout", "TableRow", "choose_table", "read_tables"]
+
+METRICS = ("psnr", "ssim", "lpips", "psnr_fg", "ssim_fg", "fps", "ms", "train_cameras", "test_camera")
+
+
+@dataclasses.dataclass(frozen=True)
+class TableRow:
+    """One row: its printed name, the variant that reproduces it, its id in the sheet of printed numbers."""
+
+    label: str = option("", "What the row is called; LaTeX between $ signs.")
+    variant: str = option("", "Variant whose results fill the row; empty for rows that are only quoted.")
+    reported: str | None = option(None, "Row id in the sheet of printed numbers; the label by default, '' for none.")
+    stage: str = option("", "speed: key of the timing; cameras: the subject.")
+    rule: bool = option(False, "Draw a line above the row.")
+    shaded: bool = option(False, "Shade the row, as the paper does with the setting it selects.")
+
+    @property
+    def reported_id(self) -> str:
+        """Row id in the sheet of printed numbers."""
+        return self.label if self.reported is None else self.reported
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """One sub-table: a protocol and its id in the sheet of printed numbers."""
+
+    title: str = option("", "Heading of the sub-table; empty where there is only one.")
+    protocol: str = option("", "Protocol whose results fill it.")
+    reported: str = option("", "Table id in the sheet of printed numbers.")
+
+
+@dataclasses.dataclass(frozen=True)
+class TableLayout:
+    """One table."""
+
+    kind: str = option(
+        "subject",
+        "subjects: metrics of each subject and their mean; mean: mean over the subjects; subject: one subject; speed: "
+        "stages of one frame; cameras: training and evaluation cameras.",
+        choices=("subjects", "mean", "subject", "speed", "cameras"),
+    )
+    title: str = option("", "Short title.")
+    caption: str = option("", "Caption; protocol, sizes and deviations are added to it.")
+    label: str = option("", "LaTeX label, without its prefix.")
+    head: str = option("Method", "Heading of the first column.")
+    size: int = option(1024, "Side of the paper's images [px]; results of another size are shown apart.", min=1)
+    subjects: list[str] = option([], "Subjects, in order.")
+    columns: list[str] = option([], "Columns, in order.", choices=METRICS)
+    ranked: bool = option(True, "Mark the best value of each column bold, the second underlined.")
+    second: bool = option(True, "Also mark the second best value.")
+    panels: list[Panel] = option([], "Sub-tables.")
+    rows: list[TableRow] = option([], "Rows, in order.")
+
+    @property
+    def variants(self) -> tuple[str, ...]:
+        """Variants whose evaluations the table shows."""
+        if self.kind == "speed":
+            return ()
+        return tuple(dict.fromkeys(row.variant for row in self.rows if row.variant))
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Protocols whose evaluations the table shows."""
+        return tuple(dict.fromkeys(panel.protocol for panel in self.panels if panel.protocol))
+
+    @property
+    def speeds(self) -> tuple[str, ...]:
+        """Variants whose timings the table shows."""
+        if self.kind != "speed" and "fps" not in self.columns:
+            return ()
+        return tuple(dict.fromkeys(row.variant for row in self.rows if row.variant))
+
+
+def read_tables(path: str | os.PathLike[str]) -> dict[str, TableLayout]:
+    """Reads the layouts of all tables, by name.
+
+    Raises:
+        ConfigError: no such file, not YAML, an unknown key, a wrong type.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError.of(path, expected="the layout of the tables (.yaml)", found="no such file") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError.of(path, expected="YAML", found=f"text that does not parse ({error})") from error
+    if not isinstance(content, dict):
+        raise ConfigError.of(path, expected="table name -> layout", found=type(content).__name__)
+    tables = {str(name): from_mapping(TableLayout, value, f"{path}: {name}") for name, value in content.items()}
+    for name, table in tables.items():
+        where = f"{path}: {name}"
+        if not table.rows or not table.panels or not table.columns:
+            raise ConfigError.of(where, expected="rows, columns and panels", found="an empty list among them")
+        if table.kind in ("subjects", "mean", "subject") and not table.subjects:
+            raise ConfigError.of(where, "subjects", expected="one subject or more", found="none")
+    return tables
+
+
+def choose_table(tables: dict[str, TableLayout], name: str, where: str) -> TableLayout:
+    """The layout of one table.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
+    if name not in tables:
+        raise ConfigError(f"{where}: unknown table '{name}'; {did_you_mean(name, tables)}")
+    return tables[name]
