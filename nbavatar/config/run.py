@@ -12,7 +12,7 @@ from nbavatar.config.avatar import RenderConfig, SpeedConfig, TrainConfig
 from nbavatar.config.core import from_mapping, merge, option, to_mapping
 from nbavatar.config.evaluation import EvaluateConfig, ProtocolConfig, ReportConfig, TableConfig
 from nbavatar.config.geometry import DeformConfig, FitConfig, SpectralConfig
-from nbavatar.config.preprocess import CropConfig, IngestConfig, MasksConfig, TracksConfig
+from nbavatar.config.preprocess import CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
 from nbavatar.errors import ConfigError, did_you_mean
 
@@ -67,6 +67,7 @@ class RunConfig:
     size_label: str = option(
         "", "What is said in every table caption when sizes are not the paper's, such as 'smoke size, 64 px'."
     )
+    frames: FramesConfig = option(FramesConfig, "Which frames are used and held out; goes to `ingest` and `tracks` alike.")
     stages: Stages = option(Stages, "Options of every stage.")
     crops: dict[str, CropConfig] = option(
         {"center": CropConfig(kind="center", size=1024), "box": CropConfig(kind="box", size=512)},
@@ -107,4 +108,6 @@ def stage_options(run: RunConfig, stage: str, variant: str | None = None) -> dic
 def _resolved(run: RunConfig, stage: str, variant: str | None) -> Any:
     base = getattr(run.stages, stage)
     over = run.variants[variant].stages.get(stage, {}) if variant is not None else {}
+    if isinstance(base, FramesConfig):  # both readers must agree on the frames
+        over = merge(over, to_mapping(run.frames))
     return from_mapping(type(base), merge(to_mapping(base), over), f"variants.{variant}.stages.{stage}")

@@ -1,0 +1,32 @@
+import subprocess
+import sys
+
+import pytest
+
+# What a GPU node needs; everything else belongs to the stages that use it.
+LIGHT = {"torch", "numpy", "numba", "PIL", "tqdm", "yaml"}
+HEAVY = ("igl", "pymeshlab", "trimesh", "OpenEXR", "cv2", "scipy", "pandas", "matplotlib", "skimage", "snakemake", "smplx")
+
+
+def test_layers_import_downwards_only():
+    out = subprocess.run([sys.executable, "-m", "importlinter.cli"], capture_output=True, text=True)
+    if "No module named" in out.stderr or out.returncode not in (0, 1):
+        from importlinter.cli import lint_imports
+
+        assert lint_imports() == 0
+    else:
+        assert out.returncode == 0, out.stdout
+
+
+@pytest.mark.parametrize("verb", ["train", "render", "speed"])
+def test_training_and_rendering_import_no_geometry_library(verb):
+    code = (
+        "import sys, importlib, argparse\n"
+        "from nbavatar.provenance import code_modules\n"
+        f"for name in code_modules('{verb}'):\n"
+        "    if name != 'nbavatar.raster.cuda': importlib.import_module(name)\n"
+        f"print([m for m in {HEAVY!r} if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert out.returncode == 0, out.stderr
+    assert out.stdout.strip().splitlines()[-1] == "[]"

@@ -1,0 +1,72 @@
+import json
+import math
+
+import pytest
+from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
+from nbavatar.errors import ConfigError
+
+HEADER = "subject\ttrain_cameras\ttest_camera\n"
+
+
+def _write(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_camera_ids_stay_text(tmp_path):
+    path = _write(tmp_path / "s.tsv", HEADER + "S3\t121,010,084\t110\n")
+    subject = read_subjects(path, "root")["S3"]
+    assert subject.train_cameras == ("121", "010", "084")
+    assert subject.cameras == ("010", "084", "110", "121")
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        (HEADER + "S1\t110,102\t102\n", "without the test camera"),
+        (HEADER + "S1\t\t102\n", "found none"),
+        (HEADER + "S1\t1\t2\nS1\t1\t2\n", "S1 again"),
+        (HEADER + "S/1\t1\t2\n", "ids of letters"),
+        (HEADER + "S1\t1\n", "3 columns"),
+        ("subject\ttest_camera\n", "header"),
+    ],
+)
+def test_wrong_subject_sheets_end_in_one_line(tmp_path, text, match):
+    with pytest.raises(ConfigError, match=match) as caught:
+        read_subjects(_write(tmp_path / "s.tsv", text), "root")
+    assert "\n" not in str(caught.value)
+
+
+def test_rows_star_means_every_subject_and_unknown_ones_are_named(tmp_path):
+    path = _write(tmp_path / "r.tsv", "subject\tvariant\tprotocol\n*\tfull\tnv\nS2\tch03\tnv\n")
+    rows = read_rows(path, ["S1", "S2"])
+    assert [(r.subject, r.variant) for r in rows] == [("S1", "full"), ("S2", "full"), ("S2", "ch03")]
+    with pytest.raises(ConfigError, match=r"line 3: unknown subject 'S2'; did you mean 'S1'"):
+        read_rows(path, ["S1"])
+
+
+def _capture(folder, angles):
+    folder.mkdir(parents=True)
+    cameras = {}
+    for name, angle in angles.items():
+        c, s = math.cos(angle), math.sin(angle)
+        cameras[name] = {"R": [[c, 0, -s], [0, 1, 0], [s, 0, c]], "t": [0, 0, 1], "width": 1, "height": 1, "K": []}
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+
+
+def test_capture_holds_out_the_most_central_camera_unless_told(tmp_path):
+    _capture(tmp_path / "demo", {"a": -0.6, "b": 0.1, "c": 0.5, "d": 0.0})
+    assert capture_subjects(str(tmp_path / "demo"), "")["demo"].test_camera == "d"
+    chosen = capture_subjects(str(tmp_path / "demo"), "a")["demo"]
+    assert chosen.test_camera == "a"
+    assert chosen.train_cameras == ("b", "c", "d")
+    with pytest.raises(ConfigError, match="unknown camera 'z'"):
+        capture_subjects(str(tmp_path / "demo"), "z")
+
+
+def test_folder_of_captures_gives_one_subject_each(tmp_path):
+    for name in ("one", "two"):
+        _capture(tmp_path / name, {"a": 0.0, "b": 0.3})
+    assert list(capture_subjects(str(tmp_path), "")) == ["one", "two"]
+    with pytest.raises(ConfigError, match="data_root"):
+        capture_subjects(str(tmp_path / "nothing"), "")
