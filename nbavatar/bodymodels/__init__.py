@@ -1,0 +1,1 @@
+"""FLAME and MANO from their official files, differentiable, without chumpy."""

@@ -1,0 +1,243 @@
+"""The allow-listed unpickler: everything the datasets hold comes back, everything else is refused by name."""
+
+import collections
+import io
+import os
+import pickle
+import sys
+import types
+
+import numpy as np
+import pytest
+import scipy.sparse
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nbavatar.errors import DataError
+from nbavatar.io.pickles import read_array, read_pickle
+
+
+def _write(path, value, protocol=2):
+    path.write_bytes(value if isinstance(value, bytes) else pickle.dumps(value, protocol=protocol))
+    return path
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_plain_data_round_trips(tmp_path, protocol):
+    rng = np.random.default_rng(0)
+    value = {
+        "084": {"intrinsic": rng.normal(size=(3, 3)), "extrinsic": rng.normal(size=(4, 4)).tolist()},
+        7: collections.OrderedDict(a=np.float32(2.5), b=np.int64(-3), c=np.bool_(True), d=np.arange(5)[::2]),
+        "cuts": [(3, 4), (9, 10)],
+        "set": {1, 2},
+        "bytes": b"\x00\xff",
+        "fortran": np.asfortranarray(rng.normal(size=(4, 5))),
+        "complex": 1j,
+        "text": np.array(["a", "bcd"]),
+    }
+    found = read_pickle(_write(tmp_path / "a.pkl", value, protocol))
+    np.testing.assert_equal(found, value)
+    assert type(found[7]) is collections.OrderedDict
+    objects = np.array([{"x": np.ones(2)}, [3, "t"], None], dtype=object)
+    found_objects = read_pickle(_write(tmp_path / "o.pkl", objects, protocol))
+    np.testing.assert_equal(found_objects.tolist(), objects.tolist())
+    assert found["fortran"].flags.writeable
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 4, 5])
+@pytest.mark.parametrize("layout", ["csc", "csr", "coo"])
+@pytest.mark.parametrize("kind", ["matrix", "array"])
+def test_sparse_matrices(tmp_path, protocol, layout, kind):
+    dense = np.random.default_rng(1).normal(size=(5, 9)) * (np.random.default_rng(2).random((5, 9)) < 0.4)
+    matrix = getattr(scipy.sparse, f"{layout}_{kind}")(dense)
+    found = read_pickle(_write(tmp_path / "s.pkl", {"J_regressor": matrix}, protocol))["J_regressor"]
+    assert found.format == layout
+    np.testing.assert_array_equal(found.toarray(), dense)
+
+
+def test_sparse_with_indices_outside_is_refused(tmp_path):
+    matrix = scipy.sparse.csc_matrix(np.eye(3))
+    matrix.indices[1] = 99
+    with pytest.raises(DataError, match="damaged"):
+        read_pickle(_write(tmp_path / "s.pkl", matrix))
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2])
+def test_numpy_1_module_paths(tmp_path, protocol):
+    """Files written by numpy 1 name numpy.core; those of numpy 2 name numpy._core."""
+    value = {"a": np.arange(6.0).reshape(2, 3), "b": np.float64(0.1)}
+    content = pickle.dumps(value, protocol=protocol)
+    for old, new in ((b"numpy._core", b"numpy.core"), (b"numpy.core", b"numpy._core")):
+        text = content.replace(old, new)
+        np.testing.assert_equal(read_pickle(_write(tmp_path / "n.pkl", text)), value)
+
+
+def test_python_2_strings_are_latin1(tmp_path):
+    # Protocol 2 of Python 2: BINSTRING-style keys and raw array bytes as str, with copy_reg and __builtin__ names.
+    raw = np.array([1.5, -2.0]).tobytes()
+    content = (
+        b"\x80\x02}U\x01aq\x01cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R"
+        b"(K\x01K\x02\x85cnumpy\ndtype\nU\x02f8K\x00K\x01\x87R(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
+        b"\x89U" + bytes([len(raw)]) + raw + b"tbs."
+    )
+    np.testing.assert_equal(read_pickle(_write(tmp_path / "p.pkl", content)), {"a": np.array([1.5, -2.0])})
+
+
+@pytest.fixture
+def chumpy(monkeypatch):
+    """Stand-ins for chumpy's classes, under its module names, so that pickles can be written as it writes them."""
+    modules = {name: types.ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")}
+    ch = type("Ch", (), {"__module__": "chumpy.ch"})
+    select = type("Select", (), {"__module__": "chumpy.reordering"})
+    modules["chumpy.ch"].Ch, modules["chumpy.reordering"].Select = ch, select
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    return ch, select
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 4])
+def test_chumpy_arrays_become_numpy(tmp_path, chumpy, protocol):
+    ch, select = (cls.__new__(cls) for cls in chumpy)
+    values = np.random.default_rng(0).normal(size=(4, 3, 20))
+    ch.__dict__.update(x=values, _dirty_vars=set(), _itr=None)
+    index = np.arange(values.size).reshape(values.shape)[:, :, :10].ravel()
+    select.__dict__.update(a=ch, idxs=index, preferred_shape=(4, 3, 10))
+    path = _write(tmp_path / "c.pkl", {"posedirs": ch, "shapedirs": select, "again": ch}, protocol)
+    for name in ("chumpy", "chumpy.ch", "chumpy.reordering"):
+        del sys.modules[name]
+    found = read_pickle(path)
+    np.testing.assert_array_equal(found["posedirs"], values)
+    np.testing.assert_array_equal(found["shapedirs"], values[:, :, :10])
+    assert found["again"] is found["posedirs"]
+
+
+def test_object_npy_with_torch_tensors(tmp_path):
+    """The published landmark files hold numpy arrays beside torch tensors."""
+    value = {"static": np.arange(4), "dynamic": torch.arange(12).reshape(3, 4), "bary": torch.rand(2, 3).T}
+    np.save(tmp_path / "e.npy", np.array(value, dtype=object), allow_pickle=True)
+    found = read_array(tmp_path / "e.npy")
+    np.testing.assert_array_equal(found["static"], value["static"])
+    np.testing.assert_array_equal(found["dynamic"], value["dynamic"].numpy())
+    np.testing.assert_array_equal(found["bary"], value["bary"].numpy())
+
+
+def test_plain_npy(tmp_path):
+    for array in (np.random.default_rng(0).normal(size=(3, 2)), np.asfortranarray(np.eye(3)), np.zeros((0, 4))):
+        np.save(tmp_path / "a.npy", array)
+        np.testing.assert_array_equal(read_array(tmp_path / "a.npy"), array)
+    objects = np.array([[1, "a"], [None, {"k": 2}]], dtype=object)
+    np.save(tmp_path / "o.npy", objects, allow_pickle=True)
+    np.testing.assert_equal(read_array(tmp_path / "o.npy"), objects)
+
+
+class _Evil:
+    def __init__(self, call, *args):
+        self.pair = (call, args)
+
+    def __reduce__(self):
+        return self.pair
+
+
+def _marker(path):
+    path.write_text("ran")
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+@pytest.mark.parametrize(
+    ("call", "args", "name"),
+    [
+        (os.system, ("touch {}",), "system"),
+        (eval, ("open({!r}, 'w')",), "eval"),
+        (getattr, ([], "append"), "getattr"),
+        (__import__, ("os",), "__import__"),
+        (np.load, ("{}",), "load"),
+        (io.open, ("{}", "w"), "open"),
+        (np.memmap, ("{}",), "memmap"),
+        (torch.load, ("{}",), "load"),
+    ],
+)
+def test_code_is_refused_by_name_and_not_run(tmp_path, protocol, call, args, name):
+    target = tmp_path / "ran"
+    evil = _Evil(call, *(a.format(str(target)) if isinstance(a, str) else a for a in args))
+    for path, reader in ((tmp_path / "e.pkl", read_pickle), (tmp_path / "e.npy", read_array)):
+        if reader is read_pickle:
+            _write(path, {"ok": 1, "bad": evil}, protocol)
+        else:
+            np.save(path, np.array([evil, None], dtype=object), allow_pickle=True)
+        with pytest.raises(DataError) as caught:
+            reader(path)
+        line = str(caught.value)
+        assert str(path) in line and name in line and "\n" not in line
+        assert not target.exists()
+
+
+def test_names_with_dots_do_not_reach_attributes(tmp_path):
+    content = b"\x80\x04\x8c\x05numpy\x8c\x0endarray.tofile\x93."
+    with pytest.raises(DataError, match=r"numpy\.ndarray\.tofile"):
+        read_pickle(_write(tmp_path / "d.pkl", content))
+
+
+def test_state_cannot_alter_the_reader(tmp_path):
+    """BUILD on an allowed function or class must not leave anything behind for the next file."""
+    for head in (
+        b"c_codecs\nencode\n",
+        b"cchumpy.ch\nCh\n",
+        b"c__builtin__\nobject\n",
+        b"cnumpy\ndtype\n",
+        b"c__builtin__\nset\n",
+    ):
+        for state in (b"}U\x01xK\x01s", b"N}U\x01xK\x01s\x86"):
+            with pytest.raises(DataError):
+                read_pickle(_write(tmp_path / "b.pkl", b"\x80\x02" + head + state + b"b."))
+    test_plain_data_round_trips(tmp_path, 2)
+
+
+def test_reconstructor_makes_data_only(tmp_path):
+    content = b"ccopy_reg\n_reconstructor\n(c__builtin__\nset\nc__builtin__\nobject\nNtR."
+    with pytest.raises(DataError, match="_reconstructor"):
+        read_pickle(_write(tmp_path / "r.pkl", content))
+
+
+def test_array_of_huge_initial_shape_is_refused(tmp_path):
+    names = b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\n"
+    content = names + b"\x8a\x06\x00\x00\x00\x00\x00\x01\x85U\x01b\x87R."
+    with pytest.raises(DataError, match="initial shape"):
+        read_pickle(_write(tmp_path / "h.pkl", content))
+
+
+def test_self_reference_survives(tmp_path):
+    value: list = [1]
+    value.append(value)
+    found = read_pickle(_write(tmp_path / "s.pkl", value))
+    assert found[1] is found
+
+
+def test_missing_and_foreign_files(tmp_path):
+    for reader in (read_pickle, read_array):
+        with pytest.raises(DataError, match="readable file"):
+            reader(tmp_path / "none")
+        with pytest.raises(DataError):
+            reader(_write(tmp_path / "x", b"GIF89a not a pickle"))
+        with pytest.raises(DataError):
+            reader(_write(tmp_path / "x", b""))
+
+
+_WHOLE = pickle.dumps(
+    {"a": np.arange(20.0), "b": [1, (2, "x")], "c": scipy.sparse.eye_array(3, format="csc")}, protocol=2
+)
+
+
+@settings(max_examples=150, deadline=None, database=None, derandomize=True)
+@given(cut=st.integers(0, len(_WHOLE) - 1), position=st.integers(0, len(_WHOLE) - 1), byte=st.integers(0, 255))
+def test_damage_is_a_data_error_or_data(tmp_path_factory, cut, position, byte):
+    """Truncation always fails cleanly; a flipped byte fails cleanly or yields data, never another exception."""
+    path = tmp_path_factory.mktemp("damage") / "a.pkl"
+    with pytest.raises(DataError):
+        read_pickle(_write(path, _WHOLE[:cut]))
+    changed = bytearray(_WHOLE)
+    changed[position] = byte
+    try:
+        read_pickle(_write(path, bytes(changed)))
+    except DataError as error:
+        assert "\n" not in str(error)
