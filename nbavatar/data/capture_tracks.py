@@ -1,0 +1,66 @@
+"""A capture's tracked meshes as a mesh sequence.
+
+Extras, besides those of `sequences`: `camera.<camera>.*`, `split`, `segments` as for Decaf, and where the capture stores
+heads without contact, `head_rigid` and `head_final` float32 [N, V, 3] [m], whichever of the two the heads are.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from nbavatar.data.capture import Capture, read_mesh, read_topology
+from nbavatar.data.sequences import MeshSequence, Part
+from nbavatar.errors import DataError
+
+__all__ = ["build_capture_tracks"]
+
+
+def build_capture_tracks(
+    capture: Capture, frames: Sequence[str], *, contact: str
+) -> tuple[MeshSequence, dict[str, Any]]:
+    """Reads the meshes of the chosen frames.
+
+    Args:
+        capture: whose.
+        frames: frame ids.
+        contact: `solve` takes `head_rigid` for the head where the capture has it; `given` takes `head`.
+
+    Returns:
+        the sequence (extras without `split` and `segments`), and a report for the record.
+
+    Raises:
+        DataError: a mesh is missing or damaged, vertex counts change, or only some frames have `head_rigid`.
+    """
+    topology = read_topology(capture.root)
+    rows: dict[str, list[np.ndarray]] = {}
+    for frame in frames:
+        mesh = read_mesh(capture.root, frame, topology)
+        for name, verts in mesh.items():
+            known = rows.setdefault(name, [])
+            if known and verts.shape != known[0].shape:
+                path = capture.root / "meshes" / f"{frame}.npz"
+                raise DataError.of(path, name, expected=f"{len(known[0])} vertices as before", found=len(verts))
+            known.append(verts)
+    rigid = rows.pop("head_rigid", None)
+    if rigid is not None and len(rigid) != len(frames):
+        expected = "head_rigid in all frames or in none"
+        raise DataError.of(capture.root / "meshes", expected=expected, found=f"it in {len(rigid)} of {len(frames)}")
+    parts: dict[str, Part] = {}
+    report: dict[str, Any] = {"rest": {}}
+    for name, (faces, rest) in topology.items():
+        verts = np.stack(rows[name])
+        if name == "head" and rigid is not None and contact == "solve":
+            verts = np.stack(rigid)
+        report["rest"][name] = "topology.npz" if rest is not None else "first frame"
+        parts[name] = Part(faces, verts[0].copy() if rest is None else rest, verts)
+    extras: dict[str, np.ndarray] = {}
+    if rigid is not None:
+        extras["head_rigid"], extras["head_final"] = np.stack(rigid), np.stack(rows["head"])
+    report["head"] = "head_rigid" if rigid is not None and contact == "solve" else "head"
+    for name, camera in capture.cameras.items():
+        extras[f"camera.{name}.K"] = camera.K
+        extras[f"camera.{name}.cam_from_world"] = camera.cam_from_world
+        extras[f"camera.{name}.distortion"] = np.zeros(12) if camera.distortion is None else camera.distortion
+        extras[f"camera.{name}.size"] = np.array([camera.width, camera.height])
+    return MeshSequence(list(frames), parts, extras), report

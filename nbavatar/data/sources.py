@@ -1,0 +1,110 @@
+"""Images of one camera, frame after frame, from either input layout: one frame is in memory at a time."""
+
+from collections.abc import Iterator
+from itertools import chain
+
+import numpy as np
+
+from nbavatar.camera.pinhole import Camera
+from nbavatar.data.capture import Capture, read_coverage, read_mask, read_rgb
+from nbavatar.data.decaf import DecafSubject
+from nbavatar.data.frame_plan import FramePlan
+from nbavatar.errors import DataError
+from nbavatar.io.video import probe_video, read_video
+
+__all__ = ["LAYERS", "capture_images", "capture_layers", "decaf_images"]
+
+LAYERS = {
+    "rgb": "colour, sRGB, uint8",
+    "person": "matte of the whole person as delivered, 0..255",
+    "label": "0 background, 1 head, 2 right hand, 3 left hand",
+    "alpha": "coverage of the labelled parts, 0..255",
+}
+
+
+def decaf_images(
+    subject: DecafSubject, camera: Camera, plan: FramePlan
+) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+    """Yields (frame id, {rgb, person}) from the two videos, decoded in step.
+
+    Raises:
+        DataError: a video is missing, truncated, has another number of frames, or the mask another size.
+    """
+    colour = subject.file("videos", f"{camera.name}.mp4")
+    matte = subject.file("segmentations", f"{camera.name}.mp4")
+    info = probe_video(matte)
+    if (info.width, info.height) != (camera.width, camera.height):
+        expected = f"{camera.width} x {camera.height} as in {colour}"
+        raise DataError.of(matte, "size", expected=expected, found=f"{info.width} x {info.height}")
+    pictures = read_video(colour, indices=plan.numbers, count=plan.count)
+    mattes = read_video(matte, indices=plan.numbers, count=plan.count, gray=True)
+    for frame in plan.frames:
+        picture, person = next(pictures, None), next(mattes, None)
+        if picture is None or person is None:  # the readers raise before this when a video is short
+            raise DataError.of(colour if picture is None else matte, f"frame {frame}", expected="a frame", found="none")
+        yield frame, {"rgb": picture, "person": person}
+    for _ in chain(pictures, mattes):  # decodes the rest, which is what finds a truncated file
+        pass
+
+
+def capture_layers(capture: Capture, camera: Camera, plan: FramePlan) -> tuple[str, ...]:
+    """Layers that `capture_images` will yield, from the kinds of masks that the capture holds.
+
+    Label masks give rgb, label, alpha; 0..255 masks, or alpha alone, give rgb and person (to be cut by the meshes); a
+    capture with neither gives rgb only, which is enough where masks are supplied separately.
+
+    Raises:
+        DataError: a frame has no mask while others have.
+    """
+    kinds: dict[str, str] = {}
+    for frame in plan.frames:
+        found = read_mask(capture, camera, frame)
+        kinds[frame] = found[0] if found else "none"
+    covered = all(read_coverage(capture, camera, frame) is not None for frame in plan.frames[:1])
+    # An empty mask (nobody in view) fits both kinds, so a person's mask anywhere decides.
+    if "none" in kinds.values():
+        lost = [frame for frame, kind in kinds.items() if kind == "none"]
+        if len(lost) < len(kinds):
+            path = capture.root / "masks" / camera.name / f"{lost[0]}.png"
+            raise DataError.of(path, expected="a mask as for the other frames", found=f"none ({len(lost)} are missing)")
+        return ("rgb", "person") if covered else ("rgb",)
+    return ("rgb", "person") if "person" in kinds.values() else ("rgb", "label", "alpha")
+
+
+def capture_images(
+    capture: Capture, camera: Camera, plan: FramePlan, layers: tuple[str, ...]
+) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+    """Yields (frame id, images of `layers`).
+
+    Coverage is the capture's alpha within its labels' reach, or 255 wherever a label is. Where alpha is above zero
+    and the label is 0 (hair, soft edges) the label is taken from the nearest labelled pixel, so that every covered
+    pixel belongs to a part.
+    """
+    for frame in plan.frames:
+        images = {"rgb": read_rgb(capture, camera, frame)}
+        mask, alpha = read_mask(capture, camera, frame), read_coverage(capture, camera, frame)
+        if "person" in layers:
+            person = mask[1] if mask else alpha
+            assert person is not None
+            images["person"] = person
+        if "label" in layers:
+            assert mask is not None
+            label = mask[1]
+            if alpha is None:
+                alpha = np.where(label > 0, np.uint8(255), np.uint8(0))
+            images["label"], images["alpha"] = _agree(label, alpha)
+        yield frame, images
+
+
+def _agree(label: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Labels spread to all covered pixels; labels where nothing is covered are dropped."""
+    orphan = (alpha > 0) & (label == 0)
+    label = np.where(alpha > 0, label, np.uint8(0))
+    if orphan.any():
+        if not label.any():
+            return label, np.zeros_like(alpha)
+        from scipy.ndimage import distance_transform_edt
+
+        rows, columns = distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+        label = np.where(orphan, label[rows, columns], label)
+    return label, alpha

@@ -1,0 +1,1 @@
+"""Masks, crops, resizing and compositing of images."""

@@ -1,0 +1,84 @@
+"""Windows cut out of images, lens distortion removed on the way, and exact area resizing.
+
+A window may stick out of the image; what lies outside is 0. With pixel centres at +0.5 the camera matrix of the result
+is that of `camera.pinhole.crop_intrinsics` followed by `scale_intrinsics`, with no half-pixel terms.
+"""
+
+import cv2
+import numpy as np
+
+from nbavatar.camera.distortion import undistortion_map
+from nbavatar.camera.pinhole import crop_intrinsics
+
+__all__ = ["Window", "resize_area", "resize_labels"]
+
+
+class Window:
+    """Cuts the same window out of many images of one camera.
+
+    Args:
+        x0: left column of the window [px]; may be negative.
+        y0: top row [px]; may be negative.
+        side: width and height of the window [px].
+        K: camera matrix of the images, needed with `distortion`.
+        distortion: lens coefficients to remove, or None. The window is then placed in the undistorted image, which has
+            the same camera matrix.
+    """
+
+    def __init__(self, x0: int, y0: int, side: int, K: np.ndarray, distortion: np.ndarray | None = None) -> None:
+        self.x0, self.y0, self.side = x0, y0, side
+        self._map = None
+        if distortion is not None:
+            self._map = undistortion_map(K, distortion, crop_intrinsics(K, x0, y0), side, side)
+
+    def cut(self, image: np.ndarray, *, labels: bool = False) -> np.ndarray:
+        """The window of a uint8 image `[H, W]` or `[H, W, 3]`, at native scale; `labels` are never mixed."""
+        if self._map is not None:
+            kind = cv2.INTER_NEAREST if labels else (cv2.INTER_CUBIC if image.ndim == 3 else cv2.INTER_LINEAR)
+            return cv2.remap(image, *self._map, interpolation=kind, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        height, width = image.shape[:2]
+        result = np.zeros((self.side, self.side, *image.shape[2:]), dtype=image.dtype)
+        left, top = max(self.x0, 0), max(self.y0, 0)
+        right, bottom = min(self.x0 + self.side, width), min(self.y0 + self.side, height)
+        if right > left and bottom > top:
+            rows, columns = slice(top - self.y0, bottom - self.y0), slice(left - self.x0, right - self.x0)
+            result[rows, columns] = image[top:bottom, left:right]
+        return result
+
+
+def resize_area(image: np.ndarray, size: int) -> np.ndarray:
+    """Resizes a square uint8 image to `size`: the mean over each pixel's area when shrinking, cubic when growing."""
+    side = image.shape[0]
+    if side == size:
+        return image
+    return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA if size < side else cv2.INTER_CUBIC)
+
+
+def resize_labels(label: np.ndarray, alpha: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Resizes part labels and their coverage together.
+
+    Each pixel gets the label that covers most of its area among the parts, and 0 only where no part touches it; so
+    every pixel with coverage belongs to a part.
+
+    Args:
+        label: uint8 `[S, S]`, 0 = background.
+        alpha: uint8 `[S, S]`, coverage.
+        size: new side [px].
+
+    Returns:
+        label, alpha: uint8 `[size, size]`.
+    """
+    alpha = np.where(label > 0, alpha, np.uint8(0))
+    if label.shape[0] == size:
+        return np.where(alpha > 0, label, np.uint8(0)), alpha
+    resized = resize_area(alpha, size)
+    best = np.zeros((size, size), dtype=np.float32)
+    result = np.zeros((size, size), dtype=np.uint8)
+    for value in np.unique(label[label > 0]):
+        weight = np.where(label == value, np.float32(1), np.float32(0))
+        kind = cv2.INTER_AREA if size < label.shape[0] else cv2.INTER_LINEAR
+        area = cv2.resize(weight, (size, size), interpolation=kind)
+        more = area > best
+        result[more], best[more] = value, area[more]
+    covered = (resized > 0) & (result > 0)
+    return np.where(covered, result, np.uint8(0)), np.where(covered, resized, np.uint8(0))
