@@ -44,6 +44,7 @@ class EvaluateConfig:
         0.5, "Pixels of at least this ground-truth coverage are the foreground of the masked metrics.", min=0.0, max=1.0
     )
     trivial: bool = option(True, "Also judge the trivial answers: background only, mean training image.")
+    mean_frames: int = option(64, "Frames a camera, evenly spaced, that make up the mean training image.", min=1)
     device: str = option("auto", "Device of LPIPS; PSNR and SSIM run on the CPU.", choices=("auto", "cpu", "cuda"))
 
 
