@@ -22,9 +22,9 @@ include: "workflow/rules/common.smk"
 
 # `all` comes first, so that it is what `snakemake` without a target makes.
 rule all:
+    default_target: True
     input:
         EVERYTHING,
-    default_target: True
 
 
 include: "workflow/rules/ingest.smk"

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from nbavatar.config.avatar import RenderConfig, SpeedConfig, TrainConfig
+from nbavatar.config.avatar import SpeedConfig, TrainConfig
 from nbavatar.config.core import from_mapping, merge, option, to_mapping
 from nbavatar.config.evaluation import EvaluateConfig, ProtocolConfig, ReportConfig, TableConfig
 from nbavatar.config.geometry import DeformConfig, FitConfig, SpectralConfig
@@ -31,7 +31,6 @@ class Stages:
     spectral: SpectralConfig = option(SpectralConfig, "Spectral coordinates.")
     deform: DeformConfig = option(DeformConfig, "Contact deformation.")
     train: TrainConfig = option(TrainConfig, "Training.")
-    render: RenderConfig = option(RenderConfig, "Rendering.")
     evaluate: EvaluateConfig = option(EvaluateConfig, "Metrics.")
     speed: SpeedConfig = option(SpeedConfig, "Timing.")
     table: TableConfig = option(TableConfig, "Tables.")
@@ -67,7 +66,9 @@ class RunConfig:
     size_label: str = option(
         "", "What is said in every table caption when sizes are not the paper's, such as 'smoke size, 64 px'."
     )
-    frames: FramesConfig = option(FramesConfig, "Which frames are used and held out; goes to `ingest` and `tracks` alike.")
+    frames: FramesConfig = option(
+        FramesConfig, "Which frames are used and held out; goes to `ingest` and `tracks` alike."
+    )
     stages: Stages = option(Stages, "Options of every stage.")
     crops: dict[str, CropConfig] = option(
         {"center": CropConfig(kind="center", size=1024), "box": CropConfig(kind="box", size=512)},

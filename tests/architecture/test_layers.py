@@ -5,7 +5,19 @@ import pytest
 
 # What a GPU node needs; everything else belongs to the stages that use it.
 LIGHT = {"torch", "numpy", "numba", "PIL", "tqdm", "yaml"}
-HEAVY = ("igl", "pymeshlab", "trimesh", "OpenEXR", "cv2", "scipy", "pandas", "matplotlib", "skimage", "snakemake", "smplx")
+HEAVY = (
+    "igl",
+    "pymeshlab",
+    "trimesh",
+    "OpenEXR",
+    "cv2",
+    "scipy",
+    "pandas",
+    "matplotlib",
+    "skimage",
+    "snakemake",
+    "smplx",
+)
 
 
 def test_layers_import_downwards_only():

@@ -43,7 +43,9 @@ def test_processes_get_distinct_gpus_and_wait_for_a_free_one(monkeypatch, tmp_pa
     environment = {k: v for k, v in devices.os.environ.items() if k != "CUDA_VISIBLE_DEVICES"}
     environment["TMPDIR"] = str(tmp_path)
     jobs = [
-        subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True, env=environment)
+        subprocess.Popen(
+            [sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True, env=environment
+        )
         for _ in range(5)
     ]
     outputs = [job.communicate()[0].strip() for job in jobs]

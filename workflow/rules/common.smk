@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
+from snakemake.io import Wildcards
 
 from nbavatar.config.run import load_run, stage_options
 from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
@@ -25,7 +26,9 @@ try:
             ("protocol", row.protocol, RUN.protocols),
         ):
             if name not in known:
-                raise NBAvatarError(f"{RUN.runs}: unknown {kind} '{name}'; {did_you_mean(name, known)}")
+                raise NBAvatarError(
+                    f"{RUN.runs}: unknown {kind} '{name}'; {did_you_mean(name, known)}"
+                )
     TABLES = read_tables(RUN.tables)
 except NBAvatarError as error:
     raise WorkflowError(str(error)) from None
@@ -62,7 +65,10 @@ def crop_options(wildcards):
 def protocol_options(wildcards):
     from nbavatar.config.core import to_mapping
 
-    return json.dumps({"name": wildcards.protocol} | to_mapping(RUN.protocols[wildcards.protocol]), sort_keys=True)
+    return json.dumps(
+        {"name": wildcards.protocol} | to_mapping(RUN.protocols[wildcards.protocol]),
+        sort_keys=True,
+    )
 
 
 def root(wildcards):
@@ -72,8 +78,16 @@ def root(wildcards):
 def split_folder(subject):
     """`train` or `test`: Decaf splits its release by subject."""
     base = Path(SUBJECTS[subject].root)
-    found = [name for name in ("train", "test") if (base / name / "params" / subject).is_dir()]
-    return base / (found[0] if found else {"S1": "test", "S3": "test", "S6": "test"}.get(subject, "train"))
+    found = [
+        name
+        for name in ("train", "test")
+        if (base / name / "params" / subject).is_dir()
+    ]
+    return base / (
+        found[0]
+        if found
+        else {"S1": "test", "S3": "test", "S6": "test"}.get(subject, "train")
+    )
 
 
 def raw_files(wildcards):
@@ -107,7 +121,11 @@ def raw_tracks(wildcards):
         base / "deformations" / subject / "deforms.npy",
         base / "contacts" / subject / "contacts_head.npy",
         base / "contacts" / subject / "contacts_rh.npy",
-        *(base / name / subject / f"{camera}.npy" for name in keyed for camera in cameras),
+        *(
+            base / name / subject / f"{camera}.npy"
+            for name in keyed
+            for camera in cameras
+        ),
         *assets(),
     ]
 
@@ -137,7 +155,9 @@ def train_frames(wildcards):
 def meshes_of(wildcards):
     """The meshes that carry a variant."""
     stage = RUN.variants[wildcards.variant].meshes
-    if RUN.layout == "capture" and (stage == "fit" or RUN.stages.tracks.contact == "given"):
+    if RUN.layout == "capture" and (
+        stage == "fit" or RUN.stages.tracks.contact == "given"
+    ):
         stage = "tracks"
     return f"{R}/{stage}/{wildcards.subject}.npz"
 
@@ -152,13 +172,19 @@ def protocol_frames(wildcards):
     """Crops that a protocol looks at: the held-out camera for novel views, the training cameras for held-out poses."""
     protocol = RUN.protocols[wildcards.protocol]
     subject = SUBJECTS[wildcards.subject]
-    cameras = [subject.test_camera] if protocol.split == "novel_view" else subject.train_cameras
+    cameras = (
+        [subject.test_camera]
+        if protocol.split == "novel_view"
+        else subject.train_cameras
+    )
     return crops_of(wildcards, wildcards.variant, protocol.crop, cameras)
 
 
 def protocol_train_frames(wildcards):
     """Training crops of the same kind: the mean training image is one of the trivial answers."""
-    return crops_of(wildcards, wildcards.variant, RUN.protocols[wildcards.protocol].crop)
+    return crops_of(
+        wildcards, wildcards.variant, RUN.protocols[wildcards.protocol].crop
+    )
 
 
 def evals_of(rows):
@@ -166,7 +192,9 @@ def evals_of(rows):
 
 
 def renders_of(rows):
-    return [f"{R}/render/{row.subject}/{row.variant}/{row.protocol}.zip" for row in rows]
+    return [
+        f"{R}/render/{row.subject}/{row.variant}/{row.protocol}.zip" for row in rows
+    ]
 
 
 def avatars():
@@ -177,7 +205,9 @@ def avatars():
 def rows_of(table):
     """The rows of the sheet that a table shows."""
     variants, protocols = TABLES[table].variants, TABLES[table].protocols
-    return [row for row in ROWS if row.variant in variants and row.protocol in protocols]
+    return [
+        row for row in ROWS if row.variant in variants and row.protocol in protocols
+    ]
 
 
 def speeds_of(table):
@@ -189,8 +219,28 @@ def speeds_of(table):
     return [f"{R}/speed/{subject}/{variant}.json" for variant, subject in first.items()]
 
 
+def report_pictures():
+    """Pictures of the geometry stages, for the report."""
+    stages = (
+        ("fit", "spectral", "deform")
+        if RUN.layout == "decaf"
+        else ("spectral", "deform")
+    )
+    if RUN.layout == "capture" and RUN.stages.tracks.contact == "given":
+        stages = ("spectral",)
+    return [
+        f"{R}/{stage}/{s}.png"
+        for stage in stages
+        for s in dict.fromkeys(row.subject for row in ROWS)
+    ]
+
+
 EVERYTHING = [
     *evals_of(ROWS),
-    *(f"{R}/tables/{table}.{suffix}" for table in TABLES for suffix in ("csv", "md", "tex")),
+    *(
+        f"{R}/tables/{table}.{suffix}"
+        for table in TABLES
+        for suffix in ("csv", "md", "tex")
+    ),
     f"{R}/report/index.html",
 ]

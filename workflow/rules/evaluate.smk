@@ -25,11 +25,10 @@ rule render:
     params:
         device=RUN.device,
         protocol=protocol_options,
-        cfg=options("render"),
         code=code_digest("render"),
     shell:
         "nbavatar render --model {input.model} --meshes {input.meshes} --frames {input.frames}"
-        " --protocol {params.protocol:q} --out {output} --device {params.device} --cfg {params.cfg:q} > {log} 2>&1"
+        " --protocol {params.protocol:q} --out {output} --device {params.device} > {log} 2>&1"
 
 
 rule evaluate:

@@ -11,11 +11,18 @@ if RUN.layout == "decaf":
     rule fit:
         input:
             tracks="results/{run}/tracks/{subject}.npz",
-            frames=lambda w: [f"{R}/ingest/{w.subject}/{c}.zip" for c in SUBJECTS[w.subject].train_cameras],
+            frames=lambda w: [
+                f"{R}/ingest/{w.subject}/{c}.zip"
+                for c in SUBJECTS[w.subject].train_cameras
+            ],
             assets=assets(),
         output:
             meshes="results/{run}/fit/{subject}.npz",
-            sheet=report("results/{run}/fit/{subject}.png", category="Geometry", caption="../report/fit.rst"),
+            sheet=report(
+                "results/{run}/fit/{subject}.png",
+                category="Geometry",
+                caption="../report/fit.rst",
+            ),
         log:
             "logs/{run}/fit/{subject}.log",
         benchmark:
@@ -38,7 +45,11 @@ rule spectral:
         fitted,
     output:
         meshes="results/{run}/spectral/{subject}.npz",
-        picture=report("results/{run}/spectral/{subject}.png", category="Geometry", caption="../report/spectral.rst"),
+        picture=report(
+            "results/{run}/spectral/{subject}.png",
+            category="Geometry",
+            caption="../report/spectral.rst",
+        ),
     log:
         "logs/{run}/spectral/{subject}.log",
     resources:
@@ -58,7 +69,11 @@ rule deform:
     output:
         meshes="results/{run}/deform/{subject}.npz",
         maps="results/{run}/deform/{subject}.exr.zip",
-        picture=report("results/{run}/deform/{subject}.png", category="Geometry", caption="../report/deform.rst"),
+        picture=report(
+            "results/{run}/deform/{subject}.png",
+            category="Geometry",
+            caption="../report/deform.rst",
+        ),
     log:
         "logs/{run}/deform/{subject}.log",
     benchmark:

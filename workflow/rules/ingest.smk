@@ -18,7 +18,9 @@ if RUN.synthetic:
                         *(
                             path
                             for c in SUBJECTS[s].cameras
-                            for path in raw_files(Wildcards(fromdict={"subject": s, "camera": c}))
+                            for path in raw_files(
+                                Wildcards(fromdict={"subject": s, "camera": c})
+                            )
                         ),
                     ]
                 )

@@ -9,13 +9,15 @@ def stage_files(stage):
         "ingest": [f"{R}/ingest/{s}/{c}.zip" for s, c in cameras],
         "tracks": [f"{R}/tracks/{s}.npz" for s in subjects],
         "masks": [f"{R}/masks/{s}/{c}.zip" for s, c in cameras],
-        "crop": [f"{R}/crop/{crop}/{s}/{c}.zip" for crop in RUN.crops for s, c in cameras],
+        "crop": [
+            f"{R}/crop/{crop}/{s}/{c}.zip" for crop in RUN.crops for s, c in cameras
+        ],
         "spectral": [f"{R}/spectral/{s}.npz" for s in subjects],
         "deform": [f"{R}/deform/{s}.npz" for s in subjects],
         "train": [f"{R}/train/{s}/{v}/model.pt" for s, v in avatars()],
         "render": renders_of(ROWS),
         "evaluate": evals_of(ROWS),
-        "speed": [f"{R}/speed/{s}/{v}.json" for s, v in avatars()],
+        "speed": sorted({path for table in TABLES for path in speeds_of(table)}),
     }
     if RUN.layout == "decaf":
         files["fit"] = [f"{R}/fit/{s}.npz" for s in subjects]

@@ -1,0 +1,75 @@
+"""Tables and the report.
+
+REQUIRED INPUTS: results/{run}/eval/**, results/{run}/speed/**, config/tables.yaml, config/reported.csv
+OUTPUTS: results/{run}/tables/{table}.{csv,md,tex}, results/{run}/report/index.html
+"""
+
+
+# A table asks for the results of its own rows only: an edit of one variant rebuilds the tables that show it.
+rule table:
+    input:
+        layout=RUN.tables,
+        reported=RUN.reported,
+        evals=lambda w: evals_of(rows_of(w.table)),
+        speeds=lambda w: speeds_of(w.table),
+    output:
+        csv="results/{run}/tables/{table}.csv",
+        md=report(
+            "results/{run}/tables/{table}.md",
+            category="Tables",
+            caption="../report/table.rst",
+        ),
+        tex="results/{run}/tables/{table}.tex",
+    log:
+        "logs/{run}/table/{table}.log",
+    resources:
+        mem="2GB",
+        runtime="10m",
+    params:
+        stem=lambda w, output: output.csv[:-4],
+        label=RUN.size_label,
+        cfg=options("table"),
+        code=code_digest("table"),
+    shell:
+        "nbavatar table --table {wildcards.table} --layout {input.layout} --reported {input.reported}"
+        " --evals {input.evals} --speeds {input.speeds} --out-stem {params.stem} --size-label {params.label:q}"
+        " --cfg {params.cfg:q} > {log} 2>&1"
+
+
+rule report:
+    input:
+        tables=[
+            f"{R}/tables/{table}.{suffix}"
+            for table in TABLES
+            for suffix in ("md", "csv")
+        ],
+        evals=evals_of(ROWS),
+        renders=renders_of(ROWS),
+        frames=sorted(
+            {
+                path
+                for row in ROWS
+                for path in protocol_frames(Wildcards(fromdict=dict(row.__dict__)))
+            }
+        ),
+        histories=[f"{R}/train/{s}/{v}/history.jsonl" for s, v in avatars()],
+        pictures=report_pictures(),
+    output:
+        report(
+            "results/{run}/report/index.html",
+            category="Report",
+            caption="../report/page.rst",
+        ),
+    log:
+        "logs/{run}/report.log",
+    resources:
+        mem="8GB",
+        runtime="30m",
+    params:
+        label=RUN.size_label,
+        cfg=options("report"),
+        code=code_digest("report"),
+    shell:
+        "nbavatar report --tables {input.tables} --evals {input.evals} --renders {input.renders}"
+        " --frames {input.frames} --histories {input.histories} --pictures {input.pictures}"
+        " --out {output} --cfg {params.cfg:q} > {log} 2>&1"
