@@ -1,0 +1,38 @@
+"""Options of the synthetic dataset. Standard library only."""
+
+import dataclasses
+
+from nbavatar.config.core import option
+
+__all__ = ["CAMERAS", "SUBJECTS", "SynthesizeConfig"]
+
+CAMERAS = ("084", "100", "102", "108", "110", "111", "121", "122")
+"""Camera ids of the release."""
+
+SUBJECTS = ("S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8")
+"""Subjects of the release; S1, S3 and S6 lie in its folder `test`, the others in `train`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SynthesizeConfig:
+    """A complete synthetic dataset in the layout of the Decaf release, body models included."""
+
+    subjects: tuple[str, ...] = option(("S1", "S2", "S3", "S4"), "Subjects to make.", choices=SUBJECTS)
+    cameras: tuple[str, ...] = option(CAMERAS, "Cameras to render.", choices=CAMERAS)
+    frames: int = option(120, "Frames a subject; one cut divides them.", min=4, max=100000)
+    width: int = option(1920, "Image width [px].", min=32, max=7680)
+    height: int = option(1080, "Image height [px].", min=32, max=4320)
+    supersample: int = option(2, "Samples a pixel along x and y.", min=1, max=4)
+    mesh: str = option(
+        "full", "Body models: 5,023 + 778 vertices like the originals, or 612 + 200.", choices=("full", "tiny")
+    )
+    focal: float = option(2.9, "Focal length as a multiple of the image height.", min=0.5, max=20.0)
+    distortion: float = option(1.0, "Factor on the lens distortion; 0 for ideal pinholes.", min=0.0, max=2.0)
+    press: float = option(6.0, "How deep the hand would reach into the undeformed face [mm].", min=0.0, max=15.0)
+    keypoint_noise: float = option(1.5, "Standard deviation of keypoints at 1080 lines [px].", min=0.0, max=50.0)
+    missing: float = option(0.03, "Share of keypoints and boxes that are missing.", min=0.0, max=0.9)
+    parameter_noise: float = option(
+        0.0, "Error of the stored parameters, in multiples of 1 mm and 0.5 degrees.", min=0.0, max=20.0
+    )
+    codec: str = option("mp4v", "FourCC code of the videos.")
+    seed: int = option(0, "Seed of everything random.", min=0)

@@ -1,0 +1,1 @@
+"""Datasets: readers of the two layouts, sequences of meshes, splits, synthetic subjects."""
