@@ -1,0 +1,68 @@
+"""Discrete Laplace-Beltrami operator of any triangle soup that shares vertices.
+
+The operator is the cotangent Laplacian of the intrinsic Delaunay triangulation of the tufted double cover (Sharp and
+Crane 2020, "A Laplacian for Nonmanifold Triangle Meshes"), from the package `robust_laplacian`. On a good Delaunay mesh
+it is the plain cotangent Laplacian; with slivers, obtuse or zero-area triangles, borders and non-manifold edges it
+stays symmetric positive semi-definite with non-positive off-diagonal entries.
+"""
+
+import numpy as np
+import scipy.sparse
+
+from nbavatar.errors import require
+
+__all__ = ["cotangent_laplacian", "robust_laplacian"]
+
+# Intrinsic mollification: the least amount, in mean edge lengths, by which the triangle inequality must hold.
+_MOLLIFY = 1e-5
+
+
+def robust_laplacian(verts: np.ndarray, faces: np.ndarray) -> tuple[scipy.sparse.csc_matrix, np.ndarray]:
+    """Robust Laplacian and lumped mass of a mesh.
+
+    Args:
+        verts: positions [m], shape (V, 3). Every vertex must be used by a face.
+        faces: vertex ids, shape (F, 3), int64; faces that name a vertex twice are ignored.
+
+    Returns:
+        The stiffness matrix (V, V), symmetric, positive semi-definite, rows summing to 0 [dimensionless], and the
+        lumped mass, positive, shape (V,) [m^2], summing to the area of the (mollified) surface.
+    """
+    package = require("robust_laplacian", "robust_laplacian", "spectral coordinates")
+    faces = np.asarray(faces, np.int64)
+    repeated = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
+    verts = np.ascontiguousarray(verts, np.float64)
+    stiffness, mass = package.mesh_laplacian(verts, np.ascontiguousarray(faces[~repeated]), mollify_factor=_MOLLIFY)
+    return scipy.sparse.csc_matrix((stiffness + stiffness.T) * 0.5), mass.diagonal()
+
+
+def cotangent_laplacian(verts: np.ndarray, faces: np.ndarray) -> tuple[scipy.sparse.csc_matrix, np.ndarray]:
+    """Plain cotangent Laplacian and barycentric lumped mass, the textbook operator (Pinkall and Polthier 1993).
+
+    Infinite cotangents of zero-area triangles are dropped. For meshes not known to be good there is `robust_laplacian`.
+
+    Args:
+        verts: positions [m], shape (V, 3).
+        faces: vertex ids, shape (F, 3).
+
+    Returns:
+        Stiffness (V, V) and lumped mass (V,) [m^2]; as `robust_laplacian`, but off-diagonal entries may be positive.
+    """
+    verts = np.asarray(verts, np.float64)
+    rows, columns, weights = [], [], []
+    double_area = np.linalg.norm(
+        np.cross(verts[faces[:, 1]] - verts[faces[:, 0]], verts[faces[:, 2]] - verts[faces[:, 0]]), axis=1
+    )
+    for corner in range(3):
+        i, j, k = (faces[:, (corner + step) % 3] for step in range(3))
+        dot = ((verts[j] - verts[i]) * (verts[k] - verts[i])).sum(1)
+        cot = np.divide(dot, double_area, out=np.zeros_like(dot), where=double_area > 0)
+        rows += [j, k]
+        columns += [k, j]
+        weights += [-0.5 * cot] * 2
+    off = scipy.sparse.coo_matrix(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(len(verts),) * 2
+    ).tocsc()
+    diagonal = -np.asarray(off.sum(axis=1)).ravel()
+    mass = np.bincount(faces.ravel(), np.repeat(double_area / 6.0, 3), minlength=len(verts))
+    return (off + scipy.sparse.diags(diagonal)).tocsc(), mass
