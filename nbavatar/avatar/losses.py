@@ -1,0 +1,145 @@
+"""Loss terms of the paper, each a pure function of tensors (sections 3.3 and 3.4; weights in section 4.1).
+
+    L = |I - GT|^2 + 0.1 LPIPS + 0.1 Dice(I_alpha^NB, GT_alpha) + 0.1 L_KNN + 0.001 L_Delta
+
+LPIPS lives in `nbavatar.metrics.lpips`. What the paper leaves open is decided here and said in each docstring.
+"""
+
+import torch
+from torch import Tensor
+
+__all__ = ["knn_graph", "loss_delta", "loss_dice", "loss_dice_haha", "loss_knn", "loss_mse"]
+
+_EPS = 1e-8
+
+
+def loss_mse(image: Tensor, target: Tensor, *, pixels: int | None = None) -> Tensor:
+    """Mean squared error of colours.
+
+    Args:
+        image, target: float [..., C, H, W] in [0, 1].
+        pixels: number of pixels the mean runs over, when the images are a window of a larger frame whose remainder is
+            equal in both (plain background); the window's own by default.
+
+    Returns:
+        Scalar.
+    """
+    squares = (image - target).square()
+    if pixels is None:
+        return squares.mean()
+    return squares.sum() / (image.shape[-3] * pixels)
+
+
+def loss_dice(predicted: Tensor, target: Tensor, *, missed: Tensor | float = 0.0) -> Tensor:
+    """Dice loss as Milletari et al. 2016 write it: 1 - 2 sum(p t) / (sum p^2 + sum t^2).
+
+    Both areas are in the denominator, so a false positive costs as much as a miss: an all-ones prediction is not free.
+    With an empty target and an empty prediction (a frame without the avatar) the loss is 0 and its gradient finite.
+
+    Args:
+        predicted: opacity of the billboards, float [..., H, W] in [0, 1].
+        target: coverage, float [..., H, W] in [0, 1].
+        missed: sum t^2 over pixels that lie outside the given window of a larger frame.
+
+    Returns:
+        Scalar in [0, 1].
+    """
+    overlap = 2.0 * (predicted * target).sum()
+    areas = predicted.square().sum() + target.square().sum() + missed
+    return 1.0 - (overlap + _EPS) / (areas + _EPS)
+
+
+def loss_dice_haha(predicted: Tensor, target: Tensor) -> Tensor:
+    """Dice variant found in the code of HAHA (Svitov et al. 2024): 1 - (2 s + 1) / (s + sum t^2 + 1), s = sum(p t).
+
+    The predicted area is counted inside the mask only, so false positives cost nothing. Kept for study, not for use.
+
+    Args:
+        predicted, target: float [..., H, W] in [0, 1].
+
+    Returns:
+        Scalar.
+    """
+    overlap = (predicted * target).sum()
+    return 1.0 - (2.0 * overlap + 1.0) / (overlap + target.square().sum() + 1.0)
+
+
+def knn_graph(points: Tensor, groups: Tensor, neighbours: int, *, include_self: bool = True) -> Tensor:
+    """Nearest points of the same group, by Euclidean distance.
+
+    Neighbours come from the canonical pose, once: a hand that touches a cheek must not tie its billboards to the
+    cheek's, so groups (parts) never mix. A group with fewer members than asked repeats its farthest one.
+
+    Args:
+        points: canonical centres [m], float [F, 3].
+        groups: part of each point, int [F].
+        neighbours: K, including the point itself if `include_self`.
+        include_self: whether the point counts as its own first neighbour (GART, HAHA: yes).
+
+    Returns:
+        int64 [F, K], global indices, nearest first.
+    """
+    result = torch.zeros(len(points), neighbours, dtype=torch.int64, device=points.device)
+    for group in torch.unique(groups).tolist():
+        members = torch.nonzero(groups == group).squeeze(1)
+        own = points[members].double()
+        skip = 0 if include_self else 1
+        count = min(neighbours + skip, len(members))
+        rows = []
+        for start in range(0, len(members), 2048):  # bounds the distance matrix
+            query = own[start : start + 2048]
+            distance = torch.cdist(query, own, compute_mode="donot_use_mm_for_euclid_dist")
+            # The point itself comes first even where others coincide with it.
+            distance[torch.arange(len(query)), torch.arange(start, start + len(query))] = -1.0
+            rows.append(distance.topk(count, largest=False, sorted=True).indices)
+        nearest = torch.cat(rows)[:, min(skip, count - 1) :]
+        if nearest.shape[1] < neighbours:
+            nearest = torch.cat((nearest, nearest[:, -1:].expand(-1, neighbours - nearest.shape[1])), dim=1)
+        result[members] = members[nearest]
+    return result
+
+
+def loss_knn(means: Tensor, quats: Tensor, half_extents: Tensor, neighbours: Tensor) -> Tensor:
+    """Keep neighbouring billboards alike and close, after GART and HAHA, on the posed primitives q', s', mu'.
+
+    Over the K neighbours of each billboard: standard deviation (unbiased) of the quaternion components and of the half
+    extents, averaged over billboards and components, plus the mean squared distance to the neighbours.
+
+    Two traps are avoided: q and -q are one rotation, so signs are aligned to the first neighbour before the deviation;
+    and the deviation is sqrt(var + 1e-8), whose gradient is finite where all neighbours agree.
+
+    Args:
+        means: posed centres [m], float [F, 3].
+        quats: posed unit quaternions wxyz, float [F, 4].
+        half_extents: posed half extents [m], float [F, 2].
+        neighbours: int64 [F, K] from `knn_graph`.
+
+    Returns:
+        Scalar; quaternion term [1], extent term [m], distance term [m^2], summed as the sources do.
+    """
+    around = quats[neighbours]
+    # torch.sign(0) is 0 and would erase a quaternion; orthogonal ones keep their sign.
+    aligned = torch.where((around * around[:, :1]).sum(-1, keepdim=True) < 0, -around, around)
+    distances = (means[neighbours] - means[:, None]).square().sum(-1)
+    return _deviation(aligned) + _deviation(half_extents[neighbours]) + distances.mean()
+
+
+def _deviation(values: Tensor) -> Tensor:
+    """Mean unbiased standard deviation along axis 1 of float [F, K, D]; 0 for one neighbour."""
+    count = values.shape[1]
+    if count < 2:
+        return values.new_zeros(())
+    variance = (values - values.mean(1, keepdim=True)).square().sum(1) / (count - 1)
+    return ((variance + _EPS).sqrt() - _EPS**0.5).mean()
+
+
+def loss_delta(offsets: Tensor) -> Tensor:
+    """Hold billboards on the mesh: mean squared length of the local offsets mu.
+
+    Args:
+        offsets: mu, in units of the face size k, float [F, 3].
+
+    Returns:
+        Scalar.
+    """
+    return offsets.square().sum(-1).mean()

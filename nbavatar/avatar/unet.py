@@ -1,0 +1,114 @@
+"""The deferred renderer R: a U-Net from rasterized features to colour and opacity.
+
+Supplement, "Renderer architecture": stride-2 convolutions with Instance Normalization and LeakyReLU on the way
+down, bilinear upsampling followed by 3x3 convolutions on the way up (no transposed convolutions, so no
+checkerboard), skip connections at every level, and two heads with sigmoids.
+
+    input   float [B, C+1, H, W]   premultiplied features and the alpha of the billboards; H, W multiples of 2^depth
+    result  colour float [B, 3, H, W] and opacity float [B, 1, H, W], both in [0, 1]
+
+The full-resolution stem has no normalisation: it keeps the absolute feature values, which Instance Normalization
+would remove, available to the last decoder stage. A level that has shrunk to a single pixel has no variance; its
+normalisation is left out there, so a 32-pixel image works at depth 5.
+"""
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["UNet", "macs"]
+
+_SLOPE = 0.2
+
+
+class _Norm(nn.InstanceNorm2d):
+    """Instance normalisation that leaves a single-pixel map as it is."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        if input.shape[-1] * input.shape[-2] == 1:
+            return input
+        return super().forward(input)
+
+
+def _stage(channels_in: int, channels_out: int, *, stride: int = 1, norm: bool = True, convs: int = 1) -> nn.Sequential:
+    """Convolution(s) 3x3, normalisation and LeakyReLU; the first convolution carries the stride."""
+    layers: list[nn.Module] = []
+    for index in range(convs):
+        first = index == 0
+        layers.append(
+            nn.Conv2d(channels_in if first else channels_out, channels_out, 3, stride if first else 1, 1, bias=not norm)
+        )
+        if norm:
+            layers.append(_Norm(channels_out, affine=True))
+        layers.append(nn.LeakyReLU(_SLOPE, inplace=True))
+    return nn.Sequential(*layers)
+
+
+class UNet(nn.Module):
+    """Renderer R of the paper.
+
+    Args:
+        channels: C+1, the input channels (features and alpha).
+        width: channels of the full-resolution level; level i has min(width * 2^i, max_width).
+        depth: number of stride-2 stages (the paper: 5).
+        max_width: cap of the channels of the deep levels.
+        convs: convolutions a level on the way down; the way up has one after the upsampling and ``convs`` after the
+            skip.
+    """
+
+    def __init__(self, channels: int, *, width: int = 32, depth: int = 5, max_width: int = 512, convs: int = 2) -> None:
+        super().__init__()
+        widths = [min(width * 2**level, max_width) for level in range(depth + 1)]
+        self.multiple = 2**depth
+        self.stem = _stage(channels, widths[0], norm=False)
+        self.down = nn.ModuleList(_stage(widths[i], widths[i + 1], stride=2, convs=convs) for i in range(depth))
+        self.lift = nn.ModuleList(_stage(widths[i + 1], widths[i]) for i in range(depth))
+        self.merge = nn.ModuleList(_stage(2 * widths[i], widths[i], norm=i > 0, convs=convs) for i in range(depth))
+        self.colour = nn.Conv2d(widths[0], 3, 3, padding=1)
+        self.opacity = nn.Conv2d(widths[0], 1, 3, padding=1)
+        self.upsample = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Decode features (B, C+1, H, W) to colour (B, 3, H, W) and opacity (B, 1, H, W).
+
+        Raises:
+            ValueError: H or W is not a multiple of 2^depth.
+        """
+        height, width = features.shape[-2:]
+        if height % self.multiple or width % self.multiple:
+            raise ValueError(
+                f"U-Net input: height and width must be multiples of {self.multiple}, found {height}x{width}"
+            )
+        value = self.stem(features)
+        skips = []
+        for stage in self.down:
+            skips.append(value)
+            value = stage(value)
+        for level in reversed(range(len(skips))):
+            value = self.lift[level](self.upsample(value))
+            value = self.merge[level](torch.cat((value, skips[level]), dim=1))
+        return torch.sigmoid(self.colour(value).float()), torch.sigmoid(self.opacity(value).float())
+
+
+def macs(network: UNet, height: int, width: int) -> int:
+    """Count the multiply-accumulates of one image of height x width pixels (convolutions only)."""
+    total = 0
+
+    def count(module: nn.Module, _inputs: object, output: Tensor) -> None:
+        nonlocal total
+        assert isinstance(module, nn.Conv2d)
+        total += output.shape[-2] * output.shape[-1] * module.weight.numel()
+
+    hooks = [m.register_forward_hook(count) for m in network.modules() if isinstance(m, nn.Conv2d)]
+    try:
+        weight = network.stem[0].weight
+        assert isinstance(weight, Tensor)
+        scale = max(1, min(height, width) // (2 * network.multiple))
+        small_h, small_w = (
+            max(network.multiple, s // scale // network.multiple * network.multiple) for s in (height, width)
+        )
+        with torch.no_grad():
+            network(torch.zeros(1, weight.shape[1], small_h, small_w, dtype=weight.dtype, device=weight.device))
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return round(total * (height * width) / (small_h * small_w))

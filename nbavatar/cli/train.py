@@ -1,0 +1,182 @@
+"""Train an avatar: neural billboards on the meshes and the U-Net that decodes them.
+
+    --frames    frame packs (.zip) of the training cameras, as `nbavatar crop` writes them: layers rgb (uint8 [H, W,
+                3]), alpha and label (uint8 [H, W]), intrinsics [px] and world-to-camera transforms [m]; frames whose
+                split is "train" are used
+    --meshes    mesh sequence (.npz): faces, rest pose and posed vertices per part [m], world, one row a frame
+    --spectral  spectral coordinates (.npz): `<part>.coords` float32 [V, K]
+    --out       model.pt, one file; opens with torch.load(weights_only=True)
+
+Beside the model, `<out>.state/` holds the last checkpoint, events.jsonl (losses, PSNR on the training views, speed) and
+previews/ (truth, render, billboard alpha, features). Stopped at any moment, the same command goes on from there. A
+state that belongs to other inputs, options or code is moved aside.
+"""
+
+import argparse
+import signal
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from nbavatar.cli.common import add_cfg_argument, stage_config
+from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.core import to_mapping
+from nbavatar.devices import device_name, lease_device
+from nbavatar.errors import DataError
+from nbavatar.io.arrays import read_arrays
+from nbavatar.io.atomic import atomic_write
+from nbavatar.provenance import run_record
+
+__all__ = ["add_arguments", "main"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the options of `nbavatar train`."""
+    parser.add_argument("--frames", nargs="+", required=True, metavar="ZIP", help="frame packs of the training cameras")
+    parser.add_argument("--meshes", required=True, metavar="NPZ", help="mesh sequence")
+    parser.add_argument(
+        "--spectral", metavar="NPZ", help="spectral coordinates; needed for init=spectral and refinement"
+    )
+    parser.add_argument("--out", required=True, metavar="PT", help="model file to write")
+    parser.add_argument("--history", metavar="JSONL", help="copy of the events to write when training is done")
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
+    parser.add_argument("--max-minutes", type=float, metavar="MIN", help="time budget instead of a number of steps")
+    add_cfg_argument(parser, TrainConfig)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Runs `nbavatar train`; 143 when it was told to terminate (its state is saved)."""
+    config = stage_config(args, TrainConfig)
+    if args.max_minutes is not None:
+        config = replace(config, max_minutes=args.max_minutes)
+    inputs = {f"frames.{i}": path for i, path in enumerate(args.frames)} | {"meshes": args.meshes}
+    if args.spectral:
+        inputs["spectral"] = args.spectral
+    for name, path in inputs.items():
+        if not Path(path).is_file():
+            raise DataError.of(path, expected=f"a file (--{name.partition('.')[0]})", found="no such file")
+    with lease_device(args.device) as device:
+        record = run_record(
+            "train", config=to_mapping(config), inputs=inputs, device=device_name(device), seed=config.seed
+        )
+        summary = _train(args, config, record, device)
+    if not summary["finished"]:
+        print(f"stopped at step {summary['steps']}; the same command goes on from there", file=sys.stderr)
+        return 143
+    last = summary["last"]
+    shown = ", ".join(
+        f"{name} {last[name]:.4g}" for name in ("psnr", "mse", "lpips", "nb") if last.get(name) is not None
+    )
+    print(f"{args.out}: {summary['steps']} steps in {summary['seconds']:.1f} s, {summary['skipped']} skipped; {shown}")
+    return 0
+
+
+def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any], device: str) -> dict[str, Any]:
+    """Reads all inputs, trains, and writes the model last."""
+    # torch is imported after the device has been leased.
+    import torch
+
+    from nbavatar.avatar.model import save_avatar
+    from nbavatar.data.sequences import read_sequence
+    from nbavatar.io.framepack import FramePack
+    from nbavatar.training.data import ViewStore, views_of
+    from nbavatar.training.loop import train
+    from nbavatar.training.setup import initial_avatar, modelled_parts, neighbour_graph
+    from nbavatar.training.state import RunFolder
+
+    sequence, _ = read_sequence(args.meshes)
+    coords = _read_coords(args.spectral, list(sequence.parts))
+    packs = [FramePack(path) for path in args.frames]
+    views = views_of(packs, sequence.frames, [pack.split("train") for pack in packs], layers=("rgb", "alpha"))
+    used = sorted({view.row for view in views})
+    parts = modelled_parts(sequence, config)
+    avatar = initial_avatar(sequence, coords, [sequence.frames[row] for row in used], config).to(device)
+    neighbours = neighbour_graph(avatar, sequence, config)
+    lpips = None
+    if config.weight_lpips > 0:
+        from nbavatar.metrics.lpips import load_lpips
+
+        lpips = load_lpips(config.lpips_net).to(device)
+    folder = RunFolder(f"{args.out}.state", {name: record[name] for name in ("config", "code", "inputs")})
+    if folder.moved_to is not None:
+        print(f"an earlier state belongs to other inputs, options or code; moved to {folder.moved_to}", file=sys.stderr)
+    bar, stop = _Bar(Path(args.out).name), _TerminationFlag()
+    summary = train(
+        avatar,
+        ViewStore(packs, views, parts, config.cache_mb * 1_000_000),
+        len(views),
+        {part: torch.from_numpy(sequence.parts[part].verts) for part in parts},
+        None if neighbours is None else neighbours.to(device),
+        lpips,
+        config,
+        folder,
+        device=device,
+        on_step=bar.step,
+        should_stop=stop.is_set,
+    )
+    bar.close()
+    if summary["finished"]:
+        avatar.record = {**record, "summary": summary, "threads": torch.get_num_threads()}
+        if args.history:
+            with atomic_write(args.history) as temporary:
+                temporary.write_bytes((folder.path / "events.jsonl").read_bytes())
+        save_avatar(args.out, avatar)
+    return summary
+
+
+def _read_coords(path: str | None, parts: list[str]) -> dict[str, Any]:
+    if path is None:
+        return {}
+    arrays, _ = read_arrays(path)
+    coords = {part: arrays[f"{part}.coords"] for part in parts if f"{part}.coords" in arrays}
+    if not coords:
+        found = ", ".join(sorted(arrays)) or "nothing"
+        raise DataError.of(path, "<part>.coords", expected=f"coordinates of {', '.join(parts)}", found=found)
+    return coords
+
+
+class _TerminationFlag:
+    """Turns SIGTERM into a question the loop asks between steps."""
+
+    def __init__(self) -> None:
+        self._set = False
+        signal.signal(signal.SIGTERM, self._handle)
+
+    def _handle(self, *_: Any) -> None:
+        self._set = True
+
+    def is_set(self) -> bool:
+        """Whether the process was asked to end."""
+        return self._set
+
+
+class _Bar:
+    """Progress bar on standard error with steps a second and the time left."""
+
+    def __init__(self, name: str) -> None:
+        from tqdm import tqdm
+
+        form = "{desc}: {percentage:3.0f}%|{bar}| {postfix} [{elapsed}]"
+        self._bar = tqdm(desc=name, total=1.0, dynamic_ncols=True, mininterval=0.5, bar_format=form)
+        self._first: tuple[float, int, float] | None = None
+
+    def step(self, step: int, progress: float, values: dict[str, float]) -> None:
+        """Shows one step."""
+        now = time.monotonic()
+        if self._first is None:
+            self._first = now, step, progress
+        began, first, done = self._first
+        spent = max(now - began, 1e-9)
+        rate = (step - first) / spent
+        left = (1.0 - progress) * spent / (progress - done) if progress > done else float("inf")
+        shown = f"step {step}, {rate:.2f} it/s, {left:.0f} s left" if step > first else f"step {step}"
+        if "psnr" in values:
+            shown += f", psnr {values['psnr']:.2f}, loss {values['loss']:.4f}"
+        self._bar.set_postfix_str(shown, refresh=False)
+        self._bar.update(progress - self._bar.n)
+
+    def close(self) -> None:
+        """Ends the bar's line."""
+        self._bar.close()

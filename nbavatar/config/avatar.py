@@ -1,0 +1,112 @@
+"""Options of training and timing an avatar. Defaults are the paper's; where it is silent, DESIGN.md says why."""
+
+from dataclasses import dataclass
+
+from nbavatar.config.core import option
+
+__all__ = ["RatesConfig", "RefineConfig", "SpeedConfig", "TrainConfig", "UNetConfig"]
+
+_PARTS = ("head", "right_hand", "left_hand")
+_PRECISIONS = ("fp32", "bf16", "fp16")
+
+
+@dataclass(frozen=True)
+class UNetConfig:
+    """The deferred renderer R."""
+
+    width: int = option(32, "Channels at full resolution; level i has min(width 2^i, max_width).", min=1)
+    depth: int = option(5, "Number of stride-2 stages.", min=1, max=8)
+    max_width: int = option(512, "Most channels of any level.", min=1)
+    convs: int = option(2, "Convolutions a level.", min=1, max=4)
+
+
+@dataclass(frozen=True)
+class RatesConfig:
+    """Adam learning rates (supplement, 'Optimization details')."""
+
+    renderer: float = option(1e-3, "U-Net.", min=0)
+    features: float = option(5e-4, "Neural textures.", min=0)
+    alpha: float = option(5e-4, "Opacity textures.", min=0)
+    colour: float = option(2.5e-3, "Textures when they hold RGB (without deferred rendering).", min=0)
+    rotation: float = option(1e-3, "Billboard quaternions.", min=0)
+    scale: float = option(5e-3, "Billboard log half extents.", min=0)
+    position: float = option(1.6e-4, "Billboard offsets, at the start.", min=0)
+    position_final: float = option(
+        0.01, "Factor on the rate of the offsets at the end, reached exponentially.", min=0, max=1
+    )
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """Compensation of fitting errors on training frames (not part of the paper; off in its protocol)."""
+
+    modes: int = option(0, "Smooth displacement modes per frame and part; 0 leaves the meshes as they are.", min=0)
+    rigid: bool = option(True, "Also refine each part's rigid pose per frame (only with modes > 0).")
+    rate: float = option(2e-4, "Adam rate of the displacement coefficients [m] and rigid motions [m, rad].", min=0)
+    weight: float = option(10.0, "Weight of the squared displacement [1/m^2].", min=0)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Training of one avatar."""
+
+    parts: list[str] | None = option(None, "Parts to model; all that the meshes have by default.", choices=_PARTS)
+    channels: int = option(6, "Feature channels C of the neural textures.", min=1, max=64)
+    texels: int = option(16, "Texels a side T of every texture.", min=1, max=64)
+    deferred: bool = option(True, "Decode features by the U-Net; false: billboards hold RGB (ablation 'w/o DNR').")
+    init: str = option("spectral", "Initial features.", choices=("spectral", "random"))
+    unet: UNetConfig = option(UNetConfig, "The deferred renderer.")
+    extent_margin: float = option(1.5, "Half extents at the start, in boxes around the triangle.", min=0.1)
+    alpha_sigma: float = option(0.5, "Standard deviation of the initial opacity, border at 1.", min=1e-3)
+    alpha_peak: float = option(0.9, "Initial opacity at the centre.", min=1e-6, max=0.999999)
+    alpha_floor: float = option(0.005, "Smallest initial opacity.", min=1e-9, max=0.999999)
+    neighbours: int = option(3, "K of the neighbour regulariser.", min=1)
+    include_self: bool = option(True, "A billboard is its own first neighbour (as in GART and HAHA).")
+
+    weight_lpips: float = option(0.1, "Weight of LPIPS, lambda_lpips.", min=0)
+    weight_nb: float = option(0.1, "Weight of the Dice loss of the billboards' silhouette, lambda_NB.", min=0)
+    weight_knn: float = option(0.1, "Weight of the neighbour regulariser, lambda_KNN.", min=0)
+    weight_delta: float = option(0.001, "Weight of the offsets, lambda_Delta.", min=0)
+    dice: str = option("milletari", "Form of the Dice loss.", choices=("milletari", "haha"))
+    lpips_net: str = option("alex", "Backbone of the training LPIPS.", choices=("alex", "vgg"))
+    lpips_full_until: float = option(0.1, "Share of training with LPIPS on the whole image, then crops.", min=0, max=1)
+    lpips_crop: int = option(256, "Side of the random LPIPS crops [px].", min=32)
+
+    schedule: str = option(
+        "fast", "fast: coarse to fine with a final decay; paper: 400,000 plain steps.", choices=("fast", "paper")
+    )
+    steps: int | None = option(None, "Optimization steps; 40,000 (fast) or 400,000 (paper) by default.", min=1)
+    max_minutes: float | None = option(
+        None, "Time budget instead of steps; the schedule follows the clock [min].", min=0
+    )
+    coarse_until: list[float] = option(
+        [0.1, 0.35], "Fast: shares of training after which the resolution doubles, up to full.", min=0, max=1
+    )
+    coarse_side: int = option(64, "Fast: no stage is coarser than this [px].", min=16)
+    final_rate: float = option(0.05, "Fast: factor on all rates at the end (cosine).", min=0, max=1)
+    decay_from: float = option(0.4, "Fast: share of training at which that decay starts.", min=0, max=1)
+    rates: RatesConfig = option(RatesConfig, "Learning rates.")
+    rate_factor: float = option(1.0, "Factor on every learning rate.", min=0)
+    clip: float = option(0.0, "Largest gradient norm of the renderer; 0 = no clipping.", min=0)
+    refine: RefineConfig = option(RefineConfig, "Compensation of fitting errors.")
+
+    roi: bool = option(True, "Decode only a window around the avatar.")
+    roi_margin: float = option(0.15, "Margin of that window, in its own size (hair has no mesh).", min=0)
+    order: str = option("ray", "Compositing order of the rasterizer: ray, kbuffer(n) or center.")
+    precision: str = option("fp32", "Arithmetic of the U-Net (autocast).", choices=_PRECISIONS)
+    max_bad_steps: int = option(20, "Non-finite steps in a row before training stops.", min=1)
+    previews: int = option(6, "Preview pictures over the whole training.", min=0)
+    checkpoint_seconds: float = option(60.0, "Time between checkpoints [s].", min=0)
+    cache_mb: int = option(2048, "Memory for decoded training frames [MB].", min=0)
+    prefetch: int = option(4, "Frames decoded ahead.", min=0)
+    seed: int = option(0, "Seed of all random numbers.", min=0)
+
+
+@dataclass(frozen=True)
+class SpeedConfig:
+    """Timing of a trained avatar."""
+
+    frames: int = option(8, "Different frames that are timed.", min=1)
+    repeats: int = option(20, "Timed passes over each stage.", min=1)
+    warmup: int = option(3, "Passes before timing starts.", min=0)
+    precisions: list[str] = option(["fp32", "bf16"], "Arithmetics of the U-Net to time.", choices=_PRECISIONS)

@@ -1,0 +1,88 @@
+"""Pictures of a trained avatar under a protocol: which frames of which cameras, on which background."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nbavatar.avatar.model import Avatar
+from nbavatar.config.evaluation import ProtocolConfig
+from nbavatar.data.sequences import MeshSequence
+from nbavatar.errors import DataError
+from nbavatar.training.data import View
+
+__all__ = ["Picture", "check_parts", "render_views"]
+
+
+class Picture(NamedTuple):
+    """One rendered view: rgb on the protocol's background uint8 (H, W, 3), alpha and nb_alpha uint8 (H, W)."""
+
+    view: View
+    rgb: np.ndarray
+    alpha: np.ndarray
+    nb_alpha: np.ndarray
+
+
+def check_parts(avatar: Avatar, sequence: MeshSequence) -> None:
+    """Assert that meshes fit an avatar.
+
+    Raises:
+        DataError: a part is missing or has another number of vertices or other faces.
+    """
+    first, offset = 0, 0
+    for part in avatar.parts:
+        if part not in sequence.parts:
+            raise DataError.of("meshes", part, expected="this part of the avatar", found=", ".join(sequence.parts))
+        mesh = sequence.parts[part]
+        count = avatar.face_counts[part]
+        own = avatar.faces[first : first + count].cpu().numpy() - offset
+        if mesh.faces.shape != own.shape or not np.array_equal(mesh.faces, own):
+            raise DataError.of(
+                "meshes", f"{part}.faces", expected=f"the {count} faces the avatar was trained on", found="other faces"
+            )
+        first, offset = first + count, offset + avatar.vertex_counts[part]
+
+
+def render_views(
+    avatar: Avatar, sequence: MeshSequence, views: Sequence[View], protocol: ProtocolConfig, *, device: str = "cpu"
+) -> Iterator[Picture]:
+    """Render views one by one.
+
+    Refinement of fitting errors applies to the frames it was trained on only; any other frame is rendered on its mesh
+    as given, so nothing is fitted to held-out poses.
+
+    Args:
+        avatar: trained, on `device`.
+        sequence: meshes of the frames (`View.row` counts in it).
+        views: what to render.
+        protocol: background, precision, order, region of interest.
+        device: where the avatar computes.
+    """
+    check_parts(avatar, sequence)
+    background = torch.tensor(protocol.background, dtype=torch.float32, device=device)
+    avatar.eval()
+    for view in views:
+        verts: Mapping[str, Tensor] = {
+            part: torch.from_numpy(np.asarray(sequence.parts[part].verts[view.row], dtype=np.float32)).to(device)
+            for part in avatar.parts
+        }
+        with torch.no_grad():
+            image, alpha, nb_alpha = avatar.render(
+                verts,
+                view.viewmat.to(device),
+                view.K.to(device),
+                view.width,
+                view.height,
+                background,
+                frame=view.frame if protocol.refined else None,
+                precision=protocol.precision,
+                roi=protocol.roi,
+                order=protocol.order,
+            )
+        yield Picture(view, _bytes(image.permute(1, 2, 0)), _bytes(alpha), _bytes(nb_alpha))
+
+
+def _bytes(values: Tensor) -> np.ndarray:
+    return (values.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy()

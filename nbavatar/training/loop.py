@@ -1,0 +1,253 @@
+"""Training of one avatar: Adam on all parameters, one view a step (paper, section 4.1; supplement A).
+
+Every random number of a step comes from (seed, step), so a run that is cut off anywhere and resumed from its last
+checkpoint computes the same bits as an unbroken one (on the CPU, with the same number of threads). A step whose loss or
+gradients are not finite is skipped and counted; several in a row end the training with one line.
+"""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from nbavatar.avatar.model import Avatar
+from nbavatar.config.avatar import TrainConfig
+from nbavatar.errors import NBAvatarError
+from nbavatar.training.data import ViewStore, ViewStream
+from nbavatar.training.objective import step_loss
+from nbavatar.training.preview import contact_sheet
+from nbavatar.training.schedule import Plan, plan_at, total_steps
+
+__all__ = ["Store", "parameter_groups", "train"]
+
+_LOG_EVERY = 25
+_POSITION = "position"
+
+
+class Store(Protocol):
+    """Where checkpoints, events and previews go (`nbavatar.training.state.RunFolder`)."""
+
+    def load(self) -> dict[str, Any] | None:
+        """Last checkpoint, or None."""
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Replace the checkpoint."""
+
+    def log(self, event: Mapping[str, Any]) -> None:
+        """Append an event."""
+
+    def preview(self, step: int, image: np.ndarray) -> None:
+        """Keep a picture."""
+
+
+def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]]:
+    """Adam groups with the rates of the supplement; each has `name` and `base`, the rate before any schedule."""
+    billboards, rates = avatar.billboards, config.rates
+    groups: list[tuple[str, float, list[nn.Parameter]]] = [
+        (_POSITION, rates.position, [billboards.mu]),
+        ("rotation", rates.rotation, [billboards.quat]),
+        ("scale", rates.scale, [billboards.log_scale]),
+        ("features", rates.features if config.deferred else rates.colour, [billboards.features]),
+        ("alpha", rates.alpha, [billboards.alpha_logit]),
+    ]
+    if avatar.unet is not None:
+        groups.append(("renderer", rates.renderer, list(avatar.unet.parameters())))
+    if avatar.refinement is not None:
+        groups.append(("refine", config.refine.rate, list(avatar.refinement.parameters())))
+    factor = config.rate_factor
+    return [
+        {"name": name, "params": params, "lr": base * factor, "base": base * factor} for name, base, params in groups
+    ]
+
+
+def train(
+    avatar: Avatar,
+    views: ViewStore,
+    count: int,
+    meshes: Mapping[str, Tensor],
+    neighbours: Tensor | None,
+    lpips: Callable[[Tensor, Tensor], Tensor] | None,
+    config: TrainConfig,
+    store: Store,
+    *,
+    device: str = "cpu",
+    on_step: Callable[[int, float, dict[str, float]], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> dict[str, Any]:
+    """Train an avatar in place.
+
+    Args:
+        avatar: in its initial state, on `device`.
+        views: training pictures; `count` of them.
+        meshes: vertices per part over all frames, float32 (N, V, 3) [m].
+        neighbours: of every billboard, int64 (F, K) on `device`, or None when the term is off.
+        lpips: perceptual distance on `device`, or None when its weight is 0.
+        config: training options.
+        store: checkpoints, events and previews.
+        device: where the avatar computes.
+        on_step: called after every step with its number, progress in [0, 1] and the last logged values.
+        should_stop: asked before every step; True checkpoints and returns early.
+
+    Returns:
+        Summary: `finished`, `steps`, `seconds`, `skipped`, `last` (logged values), `views`, `decoded`.
+
+    Raises:
+        NBAvatarError: too many non-finite steps in a row.
+    """
+    groups = parameter_groups(avatar, config)
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.999), fused=True)
+    vertices = {part: meshes[part].to(device) for part in avatar.parts}
+    clock = _Clock(config)
+    step, skipped, in_a_row = 0, 0, 0
+    state = store.load()
+    if state is not None:
+        avatar.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
+        step, skipped, in_a_row = state["step"], state["skipped"], state["in_a_row"]
+        clock.seconds_before = state["seconds"]
+    previews = _PreviewTimes(config.previews, clock.progress(step))
+    stream = ViewStream(views, count, config.seed, config.prefetch)
+    last: dict[str, float] = {}
+    side = views.side
+    saved_at = time.monotonic()
+
+    def checkpoint() -> None:
+        store.save(
+            {
+                "model": avatar.state_dict(),
+                "optimizer": optimizer.state_dict(),
+                "step": step,
+                "skipped": skipped,
+                "in_a_row": in_a_row,
+                "seconds": clock.seconds(),
+            }
+        )
+
+    avatar.train()
+    try:
+        while not clock.done(step):
+            if should_stop is not None and should_stop():
+                checkpoint()
+                return _summary(False, step, clock, skipped, last, count, views)
+            progress = clock.progress(step)
+            plan = plan_at(progress, config, side)
+            _set_rates(optimizer, plan)
+            sample = stream.get(step, plan.shrink)
+            posed = {part: vertices[part][sample.view.row] for part in avatar.parts}
+            random = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
+            optimizer.zero_grad(set_to_none=True)
+            total, terms, _ = step_loss(avatar, sample, posed, neighbours, lpips, plan, config, random)
+            good = bool(torch.isfinite(total))
+            if good:
+                total.backward()
+                good = _finite_gradients(avatar)
+            if good:
+                if config.clip > 0 and avatar.unet is not None:
+                    nn.utils.clip_grad_norm_(avatar.unet.parameters(), config.clip)
+                optimizer.step()
+                in_a_row = 0
+            else:
+                skipped, in_a_row = skipped + 1, in_a_row + 1
+                if in_a_row >= config.max_bad_steps:
+                    raise NBAvatarError(
+                        f"training: {in_a_row} steps in a row up to step {step} had a loss or gradient that is not "
+                        f"finite (camera {sample.view.camera}, frame {sample.view.frame}); "
+                        "lower rate_factor or clip the gradients (clip)"
+                    )
+            step += 1
+            progress = clock.progress(step)
+            if step % _LOG_EVERY == 0 or step == 1 or progress >= 1.0:
+                last = _values(total, terms, plan, clock, skipped)
+                store.log({"step": step, "progress": progress, **_json_safe(last)})
+            if previews.due(progress):
+                store.preview(step, contact_sheet(avatar, views.preview_samples(), vertices))
+            if on_step is not None:
+                on_step(step, progress, last)
+            if time.monotonic() - saved_at >= config.checkpoint_seconds:
+                checkpoint()
+                saved_at = time.monotonic()
+        checkpoint()
+    finally:
+        stream.close()
+    avatar.eval()
+    return _summary(True, step, clock, skipped, last, count, views)
+
+
+class _Clock:
+    """Progress by steps, or by time where a budget is given."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        self._steps = total_steps(config)
+        self._budget = None if config.max_minutes is None else 60.0 * config.max_minutes
+        self._started = time.monotonic()
+        self.seconds_before = 0.0
+
+    def seconds(self) -> float:
+        """Seconds spent on this training, earlier runs of it included."""
+        return self.seconds_before + time.monotonic() - self._started
+
+    def progress(self, step: int) -> float:
+        """Share of the training that is done, in [0, 1]."""
+        if self._budget is None:
+            return min(1.0, step / self._steps)
+        return min(1.0, self.seconds() / max(self._budget, 1e-9))
+
+    def done(self, step: int) -> bool:
+        """Whether the training is over."""
+        return self.progress(step) >= 1.0
+
+
+class _PreviewTimes:
+    """Evenly spread moments, the first after a hundredth of the training, the last at its end."""
+
+    def __init__(self, number: int, progress: float) -> None:
+        moments = [1.0] if number == 1 else [max(0.01, i / (number - 1)) for i in range(number)]
+        self._left = [moment for moment in moments if moment > progress]
+
+    def due(self, progress: float) -> bool:
+        """Whether a moment has passed since the last call."""
+        passed = [moment for moment in self._left if moment <= progress]
+        self._left = self._left[len(passed) :]
+        return bool(passed)
+
+
+def _set_rates(optimizer: torch.optim.Optimizer, plan: Plan) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] = group["base"] * plan.rate * (plan.position_rate if group["name"] == _POSITION else 1.0)
+
+
+def _finite_gradients(avatar: Avatar) -> bool:
+    # A sum is finite only if all its terms are (up to overflow, which is as bad); far cheaper than isfinite().all().
+    sums = [p.grad.sum() for p in avatar.parameters() if p.grad is not None]
+    return bool(torch.isfinite(torch.stack(sums)).all()) if sums else True
+
+
+def _values(total: Tensor, terms: Mapping[str, Tensor], plan: Plan, clock: _Clock, skipped: int) -> dict[str, float]:
+    values = {name: float(value) for name, value in terms.items()}
+    values["loss"] = float(total.detach())
+    values["psnr"] = -10.0 * math.log10(max(values["mse"], 1e-12)) if math.isfinite(values["mse"]) else math.nan
+    values |= {"shrink": plan.shrink, "rate": plan.rate, "seconds": round(clock.seconds(), 3), "skipped": skipped}
+    return values
+
+
+def _json_safe(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def _summary(
+    finished: bool, step: int, clock: _Clock, skipped: int, last: Mapping[str, float], count: int, views: ViewStore
+) -> dict[str, Any]:
+    return {
+        "finished": finished,
+        "steps": step,
+        "seconds": round(clock.seconds(), 3),
+        "skipped": skipped,
+        "last": _json_safe(last),
+        "views": count,
+        "decoded": views.decoded,
+        "cached_mb": round(views.cached_bytes / 1e6, 3),
+    }

@@ -1,0 +1,111 @@
+"""The folder beside a model in the making: what makes training resumable and watchable.
+
+    state.pt        model, optimizer, step and clock of the last checkpoint
+    events.jsonl    one line per logged step
+    key.json        what the state belongs to: configuration, code and inputs
+    previews/       pictures, named by step
+
+A folder whose key differs belongs to another experiment; it is moved aside, never mixed and never deleted.
+"""
+
+import json
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nbavatar.errors import DataError
+from nbavatar.io.atomic import atomic_write
+from nbavatar.io.images import encode_png
+from nbavatar.io.records import canonical_json, write_json
+
+__all__ = ["RunFolder"]
+
+
+class RunFolder:
+    """State of one training run on disk.
+
+    Args:
+        path: the folder; made when missing.
+        key: JSON-ready description of the experiment.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], key: Mapping[str, Any]) -> None:
+        self.path = Path(path)
+        self.moved_to: Path | None = None
+        key_file = self.path / "key.json"
+        if self.path.exists() and not self._belongs(key_file, key):
+            stamp = time.strftime("%Y%m%d-%H%M%S")
+            for number in range(1000):
+                aside = self.path.with_name(f"{self.path.name}.stale-{stamp}" + (f"-{number}" if number else ""))
+                if not aside.exists():
+                    break
+            os.replace(self.path, aside)
+            self.moved_to = aside
+        (self.path / "previews").mkdir(parents=True, exist_ok=True)
+        for leftover in self.path.glob(".*.tmp*"):  # of a run that was killed while writing
+            leftover.unlink(missing_ok=True)
+        if not key_file.exists():
+            write_json(key_file, dict(key))
+
+    @staticmethod
+    def _belongs(key_file: Path, key: Mapping[str, Any]) -> bool:
+        try:
+            return canonical_json(json.loads(key_file.read_text(encoding="utf-8"))) == canonical_json(dict(key))
+        except (OSError, ValueError):
+            # A folder without a readable key that holds nothing yet was cut off while it was being made.
+            return not (key_file.parent / "state.pt").exists()
+
+    def load(self) -> dict[str, Any] | None:
+        """Last checkpoint, or None; events that were logged after it are dropped, they will be made again."""
+        file = self.path / "state.pt"
+        if not file.exists():
+            self._rewrite_events([])
+            return None
+        try:
+            state = torch.load(file, map_location="cpu", weights_only=True)
+        except Exception as error:  # torch raises many kinds
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise DataError.of(
+                file, expected="a training state", found=f"a damaged file ({reason})", fix=f"delete {self.path}"
+            ) from error
+        self._rewrite_events([event for event in self.events() if event.get("step", 0) <= state["step"]])
+        return state
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Replace the checkpoint, atomically."""
+        with atomic_write(self.path / "state.pt") as temporary:
+            torch.save(dict(state), temporary)
+
+    def log(self, event: Mapping[str, Any]) -> None:
+        """Append one line to the events."""
+        with open(self.path / "events.jsonl", "a", encoding="utf-8") as stream:
+            stream.write(canonical_json(dict(event)) + "\n")
+
+    def events(self) -> list[dict[str, Any]]:
+        """All whole lines of the events; one that was cut off by a crash is skipped."""
+        file = self.path / "events.jsonl"
+        if not file.exists():
+            return []
+        events = []
+        for line in file.read_text(encoding="utf-8").splitlines():
+            try:
+                events.append(json.loads(line))
+            except ValueError:
+                continue
+        return events
+
+    def preview(self, step: int, image: np.ndarray) -> None:
+        """Store one picture, uint8 (H, W, 3)."""
+        with atomic_write(self.path / "previews" / f"step_{step:07d}.png") as temporary:
+            temporary.write_bytes(encode_png(image))
+
+    def _rewrite_events(self, events: list[dict[str, Any]]) -> None:
+        if events == self.events() and (self.path / "events.jsonl").exists():
+            return
+        with atomic_write(self.path / "events.jsonl") as temporary:
+            temporary.write_text("".join(canonical_json(event) + "\n" for event in events), encoding="utf-8")
