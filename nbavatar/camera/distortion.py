@@ -9,7 +9,14 @@ import numpy as np
 
 from nbavatar.errors import DataError
 
-__all__ = ["checked_coefficients", "distort_pixels", "distort_plane", "undistort_pixels", "undistortion_map"]
+__all__ = [
+    "checked_coefficients",
+    "distort_pixels",
+    "distort_plane",
+    "distort_vertices",
+    "undistort_pixels",
+    "undistortion_map",
+]
 
 _COUNTS = (4, 5, 8, 12)
 
@@ -126,3 +133,25 @@ def _to_plane(pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
 def _from_plane(xy: np.ndarray, K: np.ndarray) -> np.ndarray:
     x, y = xy[..., 0], xy[..., 1]
     return np.stack([K[0][0] * x + K[0][1] * y + K[0][2], K[1][1] * y + K[1][2]], axis=-1)
+
+
+def distort_vertices(points: np.ndarray, distortion: np.ndarray | None, reach: float) -> np.ndarray:
+    """Moves points so that a pinhole camera sees them where the lens would.
+
+    Args:
+        points: `[V, 3]` in camera axes [m]; those behind the camera stay as they are.
+        distortion: coefficients, or None.
+        reach: radius in the plane z = 1 up to which the lens model is trusted (that of the farthest image corner); beyond,
+            the displacement at that radius is kept in proportion, so that the model cannot fold points back into view.
+
+    Returns:
+        `[V, 3]`, depth unchanged.
+    """
+    if distortion is None:
+        return points
+    result = np.array(points, dtype=np.float64)
+    front = result[:, 2] > 1e-6
+    xy = result[front, :2] / result[front, 2:]
+    shrink = np.minimum(1.0, reach / np.maximum(np.linalg.norm(xy, axis=1, keepdims=True), 1e-12))
+    result[front, :2] = distort_plane(xy * shrink, distortion) / shrink * result[front, 2:]
+    return result

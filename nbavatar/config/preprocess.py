@@ -52,14 +52,19 @@ class TracksConfig(FramesConfig):
 class MasksConfig:
     """Person matte, or masks supplied by the user, to part labels and coverage."""
 
+    supplied: str = option(
+        "",
+        "Folder with masks of your own, used instead of the dataset's: [<subject>/]<camera>/<frame>.png or "
+        "[<subject>/]<camera>.mp4; labels 0..3, or 0 and 255 for the person, which is then cut by the meshes.",
+    )
     threshold: int = option(127, "A matte above this is foreground; mask videos are lossy [0..255].", min=0, max=254)
     hair_margin: float = option(0.06, "How far hair may stand off the scalp of the head mesh [m].", min=0.0)
     neck_margin: float = option(0.012, "How far the neck and the jaw may stand off the mesh [m].", min=0.0)
     hand_margin: float = option(0.008, "How far the hand may stand off the mesh [m].", min=0.0)
-    forearm_length: float = option(0.12, "Length of the stretch beyond the wrist that is cut from the head [m].", min=0.0)
-    hole_fraction: float = option(
-        0.002, "Holes smaller than this share of the part are filled [1].", min=0.0, max=1.0
+    forearm_length: float = option(
+        0.12, "Length of the stretch beyond the wrist that is cut from the head [m].", min=0.0
     )
+    hole_fraction: float = option(0.002, "Holes smaller than this share of the part are filled [1].", min=0.0, max=1.0)
     island_fraction: float = option(
         0.02, "Islands smaller than this share of the part are removed [1].", min=0.0, max=1.0
     )

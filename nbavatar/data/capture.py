@@ -31,6 +31,7 @@ __all__ = [
     "Splits",
     "find_image",
     "open_capture",
+    "parse_camera",
     "read_coverage",
     "read_mask",
     "read_mesh",
@@ -88,7 +89,7 @@ def open_capture(root: str | Path, *, pixel_center: float = 0.5) -> Capture:
     stored = read_json(path)
     if not isinstance(stored, Mapping) or not stored:
         raise DataError.of(path, expected="a mapping from camera name to its calibration", found=type(stored).__name__)
-    return Capture(root, {str(name): _camera(str(name), entry, path, pixel_center) for name, entry in stored.items()})
+    return Capture(root, {str(n): parse_camera(str(n), entry, path, pixel_center) for n, entry in stored.items()})
 
 
 def read_splits(root: Path) -> Splits:
@@ -196,7 +197,8 @@ def read_mesh(
     return result
 
 
-def _camera(name: str, entry: Any, path: Path, pixel_center: float) -> Camera:
+def parse_camera(name: str, entry: Any, path: Path, pixel_center: float = 0.5) -> Camera:
+    """Checks one entry of `cameras.json`; `path` is named in errors."""
     where = f"{path}: camera {name}"
     if not isinstance(entry, Mapping):
         raise DataError.of(where, expected="width, height, K, R, t", found=type(entry).__name__)

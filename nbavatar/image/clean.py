@@ -60,26 +60,20 @@ def clean_labels(
     return _spread(result, holes, support) if holes.any() else result
 
 
-def repair_flicker(
-    before: np.ndarray, label: np.ndarray, after: np.ndarray, support: np.ndarray, reach: np.ndarray
-) -> np.ndarray:
+def repair_flicker(before: np.ndarray, label: np.ndarray, after: np.ndarray, support: np.ndarray) -> np.ndarray:
     """Repairs what is wrong in one frame only.
 
-    Where the frames before and after agree and this one does not, theirs is taken if this frame's meshes speak for it:
-    a part that the mesh covers here too, or background out of the meshes' reach. Anything that moves fast changes the
-    meshes as well, and is left alone.
+    Where the frames before and after agree and this one does not, theirs is taken if this frame's meshes say the same.
+    Anything that moves fast moves the meshes as well, and is left alone.
 
     Args:
         before, label, after: uint8 `[H, W]`, labels of three consecutive frames.
-        support: uint8 `[H, W]`, labels of this frame's projected meshes.
-        reach: bool `[H, W]`, where a part may be in this frame, margins included.
+        support: uint8 `[H, W]`, labels of this frame's projected meshes, 0 where there is none.
 
     Returns:
         uint8 `[H, W]`.
     """
-    agreed = (before == after) & (before != label)
-    backed = np.where(before > 0, support == before, ~reach | (support == 0) & (label > 0))
-    return np.where(agreed & backed, before, label)
+    return np.where((before == after) & (before != label) & (support == before), before, label)
 
 
 def _spread(label: np.ndarray, holes: np.ndarray, support: np.ndarray) -> np.ndarray:

@@ -1,0 +1,96 @@
+"""Training images of one camera: lens distortion removed, cropped to a square, resized.
+
+Reads the frame packs of `nbavatar ingest` (rgb) and `nbavatar masks` (label, alpha; without --masks they are taken from the
+first), and for box crops the mesh sequence with the tracked boxes. Writes a frame pack:
+
+  rgb       uint8 [S, S, 3]   sRGB
+  label     uint8 [S, S]      0 background, 1 head, 2 right hand, 3 left hand
+  alpha     uint8 [S, S]      coverage; 0 where the crop sticks out of the native image
+
+with K [px] of the cropped images (K_per_frame where boxes move), distortion null, and everything else as it was.
+Kinds: `center`, the largest centred square (the paper's 1024 protocol); `box`, a square over the tracked head and hand over
+the whole sequence, with a margin (the paper's 512 protocol), or per frame; `full`, the whole frame.
+"""
+
+import argparse
+import contextlib
+from typing import Any
+
+import numpy as np
+
+from nbavatar.camera.pinhole import Camera
+from nbavatar.cli.common import add_cfg_argument, progress, stage_config
+from nbavatar.config.core import to_mapping
+from nbavatar.config.preprocess import CropConfig
+from nbavatar.data.cropping import crop_extent, frame_boxes, plan_crop
+from nbavatar.data.sequences import read_sequence
+from nbavatar.data.sources import LAYERS
+from nbavatar.errors import ConfigError, DataError
+from nbavatar.image.crop import Window, resize_area, resize_labels
+from nbavatar.io.framepack import FramePack, FramePackWriter
+from nbavatar.provenance import run_record
+
+__all__ = ["add_arguments", "main"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the options."""
+    parser.add_argument("--frames", required=True, metavar="ZIP", help="frame pack of `nbavatar ingest`")
+    parser.add_argument("--masks", metavar="ZIP", help="frame pack of `nbavatar masks`; default: labels of --frames")
+    parser.add_argument("--meshes", metavar="NPZ", help="mesh sequence; needed for box crops")
+    parser.add_argument("--out", required=True, metavar="ZIP", help="frame pack to write")
+    add_cfg_argument(parser, CropConfig)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Writes the pack."""
+    cfg = stage_config(args, CropConfig)
+    inputs = {name: getattr(args, name) for name in ("frames", "masks", "meshes") if getattr(args, name)}
+    with contextlib.ExitStack() as stack:
+        pack = stack.enter_context(FramePack(args.frames))
+        masks = stack.enter_context(FramePack(args.masks)) if args.masks else pack
+        _check(pack, masks)
+        manifest, frames = pack.manifest, pack.frames
+        lens = manifest.get("distortion") if cfg.undistort else None
+        lens = None if lens is None else np.array(lens, dtype=np.float64)
+        K = pack.intrinsics(frames[0])
+        camera = Camera(manifest["camera"], manifest["width"], manifest["height"], K, pack.cam_from_world, lens)
+        boxes, source = None, None
+        if cfg.kind == "box":
+            if not args.meshes:
+                raise ConfigError("--meshes is needed for crops of kind box")
+            boxes, source = frame_boxes(read_sequence(args.meshes)[0], camera, frames)
+        options = {key: getattr(cfg, key) for key in ("kind", "size", "pad", "per_frame", "multiple")}
+        plan = plan_crop(camera, frames, boxes=boxes, **options)
+        extra = {"subject": manifest["subject"], "camera": camera.name, "boxes": source, "missing_boxes": plan.missing,
+                 "outside": crop_extent(plan, camera), "window": list(plan.windows[frames[0]])}  # fmt: skip
+        record = run_record("crop", config=to_mapping(cfg), inputs=inputs, extra=extra)
+        layers = {name: LAYERS[name] for name in ("rgb", "label", "alpha")}
+        target: dict[str, Any] = {**manifest, "stage": "crop", "layers": layers, "record": record, "distortion": None,
+                                  "width": plan.size, "height": plan.size, "K": plan.K[frames[0]].tolist()}  # fmt: skip
+        if plan.moving:
+            target["K_per_frame"] = {frame: plan.K[frame].tolist() for frame in frames}
+        with FramePackWriter(args.out, target) as out:
+            window = None
+            for frame in progress(frames, f"crop {manifest['subject']}/{camera.name}", len(frames)):
+                if window is None or (window.x0, window.y0, window.side) != plan.windows[frame]:
+                    window = Window(*plan.windows[frame], camera.K, lens)
+                label = window.cut(masks.read("label", frame), labels=True)
+                alpha = window.cut(masks.read("alpha", frame))
+                rgb = window.cut(pack.read("rgb", frame))
+                out.add("rgb", frame, resize_area(rgb, plan.size))
+                label, alpha = resize_labels(label, alpha, plan.size)
+                out.add("label", frame, label)
+                out.add("alpha", frame, alpha)
+
+
+def _check(pack: FramePack, masks: FramePack) -> None:
+    for layer, source in (("rgb", pack), ("label", masks), ("alpha", masks)):
+        if layer not in source.layers:
+            fix = "run `nbavatar masks` and give its result by --masks" if source is pack and layer != "rgb" else ""
+            raise DataError.of(source.path, "layers", expected=layer, found=", ".join(source.layers), fix=fix)
+    for key in ("subject", "camera", "width", "height", "frames"):
+        if pack.manifest[key] != masks.manifest[key]:
+            here, there = pack.manifest[key], masks.manifest[key]
+            expected, found = (f"{len(v)} frames" if isinstance(v, list) else v for v in (here, there))
+            raise DataError.of(masks.path, key, expected=f"{expected} as in {pack.path}", found=found)

@@ -1,0 +1,89 @@
+"""Head and hand masks of one camera: the person's matte, cut by the posed meshes and cleaned.
+
+Reads a frame pack with `person` (a matte of the whole person, 0..255) or `label` masks, and a mesh sequence (.npz) with the
+same frames; or masks of your own (--supplied, or `supplied` in --cfg): FOLDER/[SUBJECT/]CAMERA/FRAME.png or
+FOLDER/[SUBJECT/]CAMERA.mp4, with labels 0..3 or with 0 and 255.
+
+Writes a frame pack of the same frames, size and camera (still distorted):
+
+  label     uint8 [H, W]      0 background, 1 head with neck and hair, 2 right hand, 3 left hand (above the wrist)
+  alpha     uint8 [H, W]      coverage, 255 = full
+
+Whatever is neither head nor hand (torso, arms) becomes background. Holes and islands that the meshes contradict are repaired,
+and so is what flickers in single frames. The record counts the pixels that each repair changed.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from nbavatar.camera.pinhole import Camera
+from nbavatar.cli.common import add_cfg_argument, progress, stage_config
+from nbavatar.config.core import to_mapping
+from nbavatar.config.preprocess import MasksConfig
+from nbavatar.data.masking import MaskNumbers, MaskStatistics, cut_masks
+from nbavatar.data.part_masks import Margins, PartCutter
+from nbavatar.data.sequences import read_sequence
+from nbavatar.data.sources import LAYERS
+from nbavatar.data.supplied_masks import supplied_masks
+from nbavatar.errors import DataError
+from nbavatar.io.framepack import FramePack, FramePackWriter
+from nbavatar.provenance import run_record
+
+__all__ = ["add_arguments", "main"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the options."""
+    parser.add_argument("--frames", required=True, metavar="ZIP", help="frame pack of `nbavatar ingest`")
+    parser.add_argument("--meshes", required=True, metavar="NPZ", help="mesh sequence of `nbavatar tracks` (or fit, deform)")
+    parser.add_argument("--supplied", metavar="DIR", help="masks of your own, instead of those in the frame pack")
+    parser.add_argument("--out", required=True, metavar="ZIP", help="frame pack to write")
+    add_cfg_argument(parser, MasksConfig)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Writes the pack."""
+    cfg = stage_config(args, MasksConfig)
+    sequence, _ = read_sequence(args.meshes)
+    with FramePack(args.frames) as pack:
+        manifest, frames = pack.manifest, pack.frames
+        sequence.index(frames)
+        K, distortion = pack.intrinsics(frames[0]), manifest.get("distortion")
+        lens = None if distortion is None else np.array(distortion, dtype=np.float64)
+        camera = Camera(manifest["camera"], manifest["width"], manifest["height"], K, pack.cam_from_world, lens)
+        margins = Margins(cfg.hair_margin, cfg.neck_margin, cfg.hand_margin, cfg.forearm_length)
+        cutter = PartCutter(sequence, camera, margins)
+        runs = [frames[first : last + 1] for first, last in manifest.get("segments", [[0, len(frames) - 1]])]
+        numbers = MaskNumbers(cfg.threshold, cfg.hole_fraction, cfg.island_fraction, cfg.temporal, cfg.soft_alpha)
+        statistics = MaskStatistics()
+        supplied = args.supplied or cfg.supplied
+        masks = _masks(pack, supplied, manifest["subject"], camera)
+        extra = {"subject": manifest["subject"], "camera": camera.name, "supplied": bool(supplied)}
+        inputs = {"frames": args.frames, "meshes": args.meshes}
+        record = run_record("masks", config=to_mapping(cfg), inputs=inputs, extra=extra)
+        layers = {name: LAYERS[name] for name in ("label", "alpha")}
+        with FramePackWriter(args.out, {**manifest, "stage": "masks", "layers": layers, "record": record}) as out:
+            cut = cut_masks(masks, cutter, runs, numbers, statistics)
+            for frame, label, alpha in progress(cut, f"masks {manifest['subject']}/{camera.name}", len(frames)):
+                out.add("label", frame, label)
+                out.add("alpha", frame, alpha)
+            record["pixels"] = dataclasses.asdict(statistics)
+
+
+def _masks(
+    pack: FramePack, supplied: str, subject: str, camera: Camera
+) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
+    """(frame, mask, coverage or None), from the user's files or from the pack."""
+    if supplied:
+        own = supplied_masks(supplied, subject, camera.name, pack.frames, camera.width, camera.height)
+        return ((frame, mask, None) for frame, mask in zip(pack.frames, own))
+    if "label" in pack.layers:
+        alpha = "alpha" in pack.layers
+        return ((f, pack.read("label", f), pack.read("alpha", f) if alpha else None) for f in pack.frames)
+    if "person" in pack.layers:
+        return ((frame, pack.read("person", frame), None) for frame in pack.frames)
+    fix = "supply masks of your own with --supplied"
+    raise DataError.of(pack.path, "layers", expected="person or label", found=", ".join(pack.layers), fix=fix)

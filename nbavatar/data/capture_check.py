@@ -1,0 +1,257 @@
+"""Everything that can be wrong with a capture, found in one go and said in one line each."""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nbavatar.camera.pinhole import Camera
+from nbavatar.data.capture import (
+    Capture,
+    parse_camera,
+    read_coverage,
+    read_mask,
+    read_mesh,
+    read_rgb,
+    read_splits,
+    read_topology,
+)
+from nbavatar.data.sequences import PARTS
+from nbavatar.errors import DataError
+from nbavatar.io.records import read_json
+from nbavatar.mesh.topology import mesh_defects
+from nbavatar.mesh.zbuffer import rasterize_mesh
+
+__all__ = ["CaptureReport", "check_capture"]
+
+_SIZES = {"head": (0.1, 0.8), "right_hand": (0.05, 0.7), "left_hand": (0.05, 0.7)}  # plausible diagonals [m]
+_LEAST_OVERLAP = 0.25
+
+
+@dataclasses.dataclass
+class CaptureReport:
+    """What a check found.
+
+    Attributes:
+        defects: lines that name what has to be mended before the capture can be used.
+        notes: lines about what is unusual but usable.
+        overlap: camera -> mean share of the masks that the projected meshes cover.
+        capture: the capture, if its cameras can be read.
+        frames: frame ids.
+        topology: faces and rest vertices of the parts.
+    """
+
+    defects: list[str] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+    overlap: dict[str, float] = dataclasses.field(default_factory=dict)
+    capture: Capture | None = None
+    frames: list[str] = dataclasses.field(default_factory=list)
+    topology: dict[str, tuple[np.ndarray, np.ndarray | None]] = dataclasses.field(default_factory=dict)
+
+
+class _Collector:
+    """Collects defects; many of one kind become one line with a count."""
+
+    def __init__(self, lines: list[str]) -> None:
+        self._lines, self._groups = lines, {}
+
+    def attempt(self, group: str, call: Callable[[], Any]) -> Any:
+        """The call's result, or None after noting its error."""
+        try:
+            return call()
+        except DataError as error:
+            self.note(group, str(error))
+            return None
+
+    def note(self, group: str, line: str) -> None:
+        self._groups.setdefault(group, []).append(line)
+
+    def close(self) -> None:
+        for lines in self._groups.values():
+            more = f" (and {len(lines) - 1} more like it)" if len(lines) > 1 else ""
+            self._lines.append(lines[0] + more)
+
+
+def check_capture(
+    root: str | Path, progress: Callable[[Iterable[str], str], Iterable[str]] = lambda items, _: items
+) -> CaptureReport:
+    """Reads every file of a capture and compares them with each other.
+
+    Args:
+        root: folder of the capture.
+        progress: wraps the loop over the frames of a camera, for a progress bar.
+
+    Returns:
+        the report; the capture is usable if `defects` is empty.
+    """
+    root = Path(root)
+    report = CaptureReport()
+    found = _Collector(report.defects)
+    if not root.is_dir():
+        report.defects.append(f"{root}: expected the folder of a capture, found no such folder")
+        return report
+    cameras = found.attempt("cameras", lambda: _cameras(root, found)) or {}
+    splits = found.attempt("splits", lambda: read_splits(root))
+    report.topology = found.attempt("topology", lambda: read_topology(root)) or {}
+    if cameras:
+        report.capture = Capture(root, cameras)
+    if splits is not None:
+        report.frames = splits.frames
+    meshes = _check_meshes(root, report, found) if report.topology and report.frames else {}
+    for camera in cameras.values():
+        _check_camera(Capture(root, cameras), camera, report, meshes, found, progress)
+    if len(cameras) == 1:
+        report.notes.append(f"{root / 'cameras.json'}: one camera only; no camera is left to evaluate on")
+    _notes_on_topology(root, report)
+    found.close()
+    return report
+
+
+def _cameras(root: Path, found: _Collector) -> dict[str, Camera]:
+    path = root / "cameras.json"
+    stored = read_json(path)
+    if not isinstance(stored, Mapping) or not stored:
+        raise DataError.of(path, expected="a mapping from camera name to its calibration", found=type(stored).__name__)
+    cameras = {}
+    for name, entry in stored.items():
+        camera = found.attempt(f"camera {name}", lambda: parse_camera(str(name), entry, path))  # noqa: B023
+        if camera is not None:
+            cameras[str(name)] = camera
+    return cameras
+
+
+def _check_meshes(root: Path, report: CaptureReport, found: _Collector) -> dict[str, dict[str, np.ndarray]]:
+    meshes: dict[str, dict[str, np.ndarray]] = {}
+    for frame in report.frames:
+        mesh = found.attempt("meshes", lambda: read_mesh(root, frame, report.topology))  # noqa: B023
+        if mesh is None:
+            continue
+        first = next(iter(meshes.values()), mesh)
+        path = root / "meshes" / f"{frame}.npz"
+        if {n: v.shape for n, v in mesh.items() if n in first} != {n: v.shape for n, v in first.items() if n in mesh}:
+            found.note("counts", f"{path}: expected as many vertices as in the frames before, found another number")
+            continue
+        if ("head_rigid" in mesh) != ("head_rigid" in first):
+            found.note("rigid", f"{path}: head_rigid: expected it in all frames or in none, found it only in some")
+        for part, (low, high) in _SIZES.items():
+            if part in mesh:
+                size = float(np.linalg.norm(np.ptp(mesh[part], axis=0)))
+                if not low <= size <= high:
+                    expected = f"a size of {low} to {high} m"
+                    error = DataError.of(path, part, expected=expected, found=f"{size:.3g}", fix="lengths must be metres")
+                    found.note(f"size {part}", str(error))
+        meshes[frame] = mesh
+    if meshes:
+        mesh = next(iter(meshes.values()))
+        for part, (faces, _) in report.topology.items():
+            corners = mesh[part][faces].astype(np.float64) - mesh[part].mean(axis=0)
+            volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+            if volume < 0:
+                where = root / "meshes" / "topology.npz"
+                error = DataError.of(
+                    where, f"{part}_faces", expected="corners counter-clockwise seen from outside", found="clockwise",
+                    fix="swap two columns",
+                )  # fmt: skip
+                found.note(f"winding {part}", str(error))
+    return meshes
+
+
+def _check_camera(
+    capture: Capture,
+    camera: Camera,
+    report: CaptureReport,
+    meshes: Mapping[str, Mapping[str, np.ndarray]],
+    found: _Collector,
+    progress: Callable[[Iterable[str], str], Iterable[str]],
+) -> None:
+    name, kinds, covered, overlaps = camera.name, {}, {}, []
+    masks_folder = capture.root / "masks" / name
+    labels: set[int] = set()
+    for frame in progress(report.frames, f"check {name}"):
+        found.attempt(f"images {name}", lambda: read_rgb(capture, camera, frame))  # noqa: B023
+        mask = found.attempt(f"masks {name}", lambda: read_mask(capture, camera, frame))  # noqa: B023
+        alpha = found.attempt(f"alpha {name}", lambda: read_coverage(capture, camera, frame))  # noqa: B023
+        covered[frame] = alpha is not None
+        kinds[frame] = mask[0] if mask else "none"
+        if mask is None:
+            continue
+        if mask[0] == "label":
+            labels |= set(np.unique(mask[1]).tolist())
+            if alpha is not None and not ((alpha > 0) & (mask[1] > 0)).any() and (mask[1] > 0).any():
+                line = DataError.of(
+                    capture.root / "alpha" / name / frame, expected="coverage where the mask has parts", found="none"
+                )  # fmt: skip
+                found.note(f"alpha agreement {name}", str(line))
+        if not (mask[1] > 0).any():
+            report.notes.append(f"{masks_folder / frame}: the mask is empty")
+        elif frame in meshes:
+            overlaps.append(_overlap(camera, report.topology, meshes[frame], mask[1]))
+    missing = [frame for frame, kind in kinds.items() if kind == "none"]
+    if missing and len(missing) < len(kinds):
+        found.note(f"no mask {name}", f"{masks_folder / missing[0]}.png: expected a mask, found none ({len(missing)} missing)")
+    elif missing and not any(covered.values()):
+        line = DataError.of(masks_folder, expected="a mask (or an alpha image) for each frame", found="none")
+        found.note(f"no mask {name}", str(line))
+    if any(covered.values()) and not all(covered.values()):
+        lost = next(frame for frame, there in covered.items() if not there)
+        line = DataError.of(capture.root / "alpha" / name / f"{lost}.png", expected="alpha for all frames or none", found="none")
+        found.note(f"no alpha {name}", str(line))
+    if {"label", "person"} <= set(kinds.values()):
+        expected, grey = "labels 0..3 in all masks, or 0..255 in all", sum(k == "person" for k in kinds.values())
+        line = DataError.of(masks_folder, expected=expected, found=f"{grey} of {len(kinds)} masks with values above 3")
+        found.note(f"mixed masks {name}", str(line))
+    for value in sorted(labels - {0}):
+        part = PARTS[value - 1]
+        if report.topology and part not in report.topology:
+            where = capture.root / "meshes" / "topology.npz"
+            line = DataError.of(where, f"{part}_faces", expected=f"a mesh for label {value} of the masks", found="none")
+            found.note(f"label {value}", str(line))
+    if overlaps:
+        report.overlap[name] = float(np.mean(overlaps))
+        if report.overlap[name] < _LEAST_OVERLAP:
+            line = DataError.of(
+                f"{capture.root / 'cameras.json'}: camera {name}",
+                expected="meshes that project onto the masks",
+                found=f"an overlap of {report.overlap[name]:.0%}",
+                fix="R, t must map world to camera (OpenCV axes), lengths be metres; see the overlay",
+            )
+            found.note(f"overlap {name}", str(line))
+
+
+def _overlap(
+    camera: Camera,
+    topology: Mapping[str, tuple[np.ndarray, np.ndarray | None]],
+    mesh: Mapping[str, np.ndarray],
+    mask: np.ndarray,
+) -> float:
+    """Intersection over union of mask and mesh silhouette, at a quarter of the resolution."""
+    step = max(1, max(camera.width, camera.height) // 256)
+    K = camera.K.copy()
+    K[:2] /= step
+    small = mask[step // 2 :: step, step // 2 :: step] > 0
+    height, width = small.shape
+    covered = np.zeros_like(small)
+    for part, (faces, _) in topology.items():
+        covered |= rasterize_mesh(mesh[part], faces, K, width, height, cam_from_world=camera.cam_from_world)[0] >= 0
+    return float((covered & small).sum() / max((covered | small).sum(), 1))
+
+
+def _notes_on_topology(root: Path, report: CaptureReport) -> None:
+    for part, (faces, rest) in report.topology.items():
+        verts = rest if rest is not None else None
+        if verts is None:
+            continue
+        defects = mesh_defects(verts.astype(np.float64), faces)
+        unusual = {
+            "faces with a vertex twice": len(defects.repeated_vertex),
+            "duplicate faces": len(defects.duplicate),
+            "faces without area": len(defects.zero_area),
+            "edges of three faces or more": len(defects.non_manifold),
+            "edges between faces of opposite winding": len(defects.inconsistent),
+            "vertices without a face": len(defects.unreferenced),
+        }
+        said = ", ".join(f"{count} {what}" for what, count in unusual.items() if count)
+        if said:
+            report.notes.append(f"{root / 'meshes' / 'topology.npz'}: {part}: {said}")

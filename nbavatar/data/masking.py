@@ -1,0 +1,131 @@
+"""From mattes and meshes to the label and coverage of every frame of one camera, three frames in memory at a time."""
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import cv2
+import numpy as np
+
+from nbavatar.data.part_masks import PartCutter
+from nbavatar.image.clean import clean_labels, repair_flicker
+
+__all__ = ["MaskNumbers", "MaskStatistics", "cut_masks"]
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskNumbers:
+    """Thresholds of the clean-up; see `config.preprocess.MasksConfig`."""
+
+    threshold: int
+    hole_fraction: float
+    island_fraction: float
+    temporal: bool
+    soft_alpha: bool
+
+
+@dataclasses.dataclass
+class MaskStatistics:
+    """What the clean-up did, summed over frames [px]."""
+
+    labelled: int = 0
+    dropped: int = 0
+    removed: int = 0
+    filled: int = 0
+    flicker: int = 0
+    empty_frames: list[str] = dataclasses.field(default_factory=list)
+
+
+@dataclasses.dataclass
+class _Frame:
+    name: str
+    mask: np.ndarray
+    coverage: np.ndarray | None
+    label: np.ndarray
+    support: np.ndarray
+
+
+def cut_masks(
+    masks: Iterable[tuple[str, np.ndarray, np.ndarray | None]],
+    cutter: PartCutter,
+    runs: Sequence[Sequence[str]],
+    numbers: MaskNumbers,
+    statistics: MaskStatistics,
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yields (frame, label uint8 `[H, W]`, alpha uint8 `[H, W]`) in the order of `masks`.
+
+    Args:
+        masks: (frame, mask, coverage or None) in time order. A mask with values above 3 is a person's matte and is
+            cut by the meshes; one of 0..3 holds labels already and is only cleaned.
+        cutter: the camera's.
+        runs: frames of each uncut run; flicker is not repaired across cuts.
+        numbers: thresholds.
+        statistics: filled in on the way.
+    """
+    run_of: Mapping[str, int] = {frame: number for number, run in enumerate(runs) for frame in run}
+    window: list[_Frame] = []
+    for name, mask, coverage in masks:
+        window.append(_prepare(name, mask, coverage, cutter, numbers, statistics))
+        if len(window) == 3:
+            yield _finish(window[0], window[1], window[2], run_of, numbers, statistics)
+            window.pop(0)
+        elif len(window) == 1:
+            first = window[0]
+        else:
+            yield _finish(None, first, window[1], run_of, numbers, statistics)
+    if window:
+        yield _finish(None, window[-1], None, run_of, numbers, statistics)
+
+
+def _prepare(
+    name: str,
+    mask: np.ndarray,
+    coverage: np.ndarray | None,
+    cutter: PartCutter,
+    numbers: MaskNumbers,
+    statistics: MaskStatistics,
+) -> _Frame:
+    outlines = cutter.silhouettes(name)
+    if mask.max(initial=0) > 3:
+        label = cutter.cut(mask, outlines, numbers.threshold)
+        statistics.dropped += int(((mask > numbers.threshold) & (label == 0)).sum())
+    else:
+        label = mask
+    cleaned = clean_labels(
+        label, outlines.support, hole_fraction=numbers.hole_fraction, island_fraction=numbers.island_fraction
+    )
+    statistics.removed += int(((label > 0) & (cleaned == 0)).sum())
+    statistics.filled += int(((label == 0) & (cleaned > 0)).sum())
+    return _Frame(name, mask, coverage, cleaned, outlines.support)
+
+
+def _finish(
+    before: _Frame | None,
+    now: _Frame,
+    after: _Frame | None,
+    run_of: Mapping[str, int],
+    numbers: MaskNumbers,
+    statistics: MaskStatistics,
+) -> tuple[str, np.ndarray, np.ndarray]:
+    label = now.label
+    matte = now.mask.max(initial=0) > 3  # labels that were given are not second-guessed
+    if numbers.temporal and matte and before is not None and after is not None:
+        if run_of.get(before.name) == run_of.get(now.name) == run_of.get(after.name):
+            label = repair_flicker(before.label, now.label, after.label, now.support)
+            statistics.flicker += int((label != now.label).sum())
+    if now.coverage is not None:
+        alpha = np.where(label > 0, now.coverage, np.uint8(0))
+    else:
+        alpha = np.where(label > 0, np.uint8(255), np.uint8(0))
+        if numbers.soft_alpha and matte:
+            alpha = _soften(alpha, now.mask)
+    label = np.where(alpha > 0, label, np.uint8(0))
+    statistics.labelled += int((label > 0).sum())
+    if not label.any():
+        statistics.empty_frames.append(now.name)
+    return now.name, label, alpha
+
+
+def _soften(alpha: np.ndarray, matte: np.ndarray) -> np.ndarray:
+    """The matte's grey values in a two-pixel rim of the coverage; inside it stays full."""
+    inside = cv2.erode(alpha, np.ones((5, 5), np.uint8), borderValue=255)
+    return np.where(inside > 0, alpha, np.where(alpha > 0, matte, np.uint8(0)))

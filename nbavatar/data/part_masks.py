@@ -1,0 +1,196 @@
+"""Head and hand cut out of a person's matte by the posed meshes.
+
+The matte knows where the person ends, the meshes know what is head (with neck) and what is hand (above the wrist). Neither
+alone suffices: hair, brows and lips stand off the head's mesh, and the matte holds the torso and both arms.
+
+Every foreground pixel is given to the nearest projected surface: pixels under a mesh to the mesh in front, others to the
+nearest silhouette, if it is within that surface's margin [m]. Margins are wide over the scalp (hair) and narrow along neck,
+jaw and hand. Two kinds of helper surfaces take what is not wanted: a sleeve beyond each wrist, which also hides what
+is behind it, and a collar beyond the neck, which opens like shoulders do and never hides anything. Both are extruded from
+the open border of the part; a part without one (a closed mesh) gets none.
+
+Limits: long hair below the margin is cut; a forearm that bends sharply at the wrist and passes in front of the face beyond
+the sleeve's length counts as head.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from nbavatar.camera.distortion import distort_vertices
+from nbavatar.camera.pinhole import Camera
+from nbavatar.data.sequences import PARTS, MeshSequence
+from nbavatar.image.clean import threshold_matte
+from nbavatar.mesh.topology import boundary_loops
+from nbavatar.mesh.zbuffer import rasterize_mesh
+
+__all__ = ["Margins", "PartCutter", "Silhouettes"]
+
+LABELS = {name: i + 1 for i, name in enumerate(PARTS)}
+_RINGS = 5
+_COLLAR_LENGTH = 0.25  # [m]
+_COLLAR_FLARE = 1.2  # radius gained per length
+_SLEEVE_FLARE = 0.12
+
+
+@dataclasses.dataclass(frozen=True)
+class Margins:
+    """How far the person may stand off each surface, and the sleeve's length, all [m]; see `MasksConfig`."""
+
+    hair: float
+    neck: float
+    hand: float
+    sleeve: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Silhouettes:
+    """Projected surfaces of one frame.
+
+    Attributes:
+        support: uint8 `[H, W]`, part that is in front, 0 where there is none or a sleeve hides it.
+        nearest: uint8 `[H, W]`, part whose surface is nearest and within its margin, 0 where there is none.
+    """
+
+    support: np.ndarray
+    nearest: np.ndarray
+
+
+class PartCutter:
+    """Cuts the mattes of one camera.
+
+    Args:
+        sequence: posed meshes; parts that are absent are not looked for.
+        camera: its size, matrix and distortion are those of the mattes.
+        margins: see `Margins`.
+    """
+
+    def __init__(self, sequence: MeshSequence, camera: Camera, margins: Margins) -> None:
+        self._sequence, self._camera = sequence, camera
+        corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], dtype=np.float64)
+        self._reach = float(
+            np.linalg.norm((corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], axis=1).max() * 1.1
+        )
+        self._borders: dict[str, np.ndarray] = {}
+        faces, owners, reaches, solid = [], [], [], []
+        offset = 0
+        for name, part in sequence.parts.items():
+            hair = margins.hair if name == "head" else 0.0
+            narrow = margins.neck if name == "head" else margins.hand
+            border = _border(part.rest, part.faces)
+            faces.append(part.faces + offset)
+            owners.append(np.full(len(part.faces), LABELS[name], dtype=np.uint8))
+            reaches.append(np.maximum(_scalp(part.rest, part.faces, border) * hair, narrow))
+            solid.append(np.ones(len(part.faces), dtype=bool))
+            offset += len(part.rest)
+            if border is not None and (name == "head" or margins.sleeve > 0):
+                self._borders[name] = border
+                strips = _strips(len(border)) + offset
+                faces.append(strips)
+                owners.append(np.zeros(len(strips), dtype=np.uint8))
+                reaches.append(np.zeros(len(strips)))
+                solid.append(np.full(len(strips), name != "head"))
+                offset += len(border) * _RINGS
+        self._faces, self._solid = np.concatenate(faces), np.concatenate(solid)
+        self._owner, self._margin = np.concatenate(owners), np.concatenate(reaches).astype(np.float32)
+        self._lengths = {name: _COLLAR_LENGTH if name == "head" else margins.sleeve for name in self._borders}
+
+    def silhouettes(self, frame: str) -> Silhouettes:
+        """Projects the meshes of one frame into the (distorted) image."""
+        row = self._sequence.index([frame])[0]
+        world = []
+        for name, part in self._sequence.parts.items():
+            verts = part.verts[row].astype(np.float64)
+            world.append(verts)
+            if name in self._borders:
+                flare = _COLLAR_FLARE if name == "head" else _SLEEVE_FLARE
+                world.append(_extrude(verts, self._borders[name], self._lengths[name], flare))
+        pose = self._camera.cam_from_world
+        points = np.concatenate(world) @ pose[:3, :3].T + pose[:3, 3]
+        points = distort_vertices(points, self._camera.distortion, self._reach)
+        width, height = self._camera.width, self._camera.height
+        face, _, depth = rasterize_mesh(points, self._faces[self._solid], self._camera.K, width, height)
+        face = np.where(face >= 0, np.flatnonzero(self._solid)[face], -1)
+        if not self._solid.all():
+            soft = np.flatnonzero(~self._solid)
+            behind, _, far = rasterize_mesh(points, self._faces[soft], self._camera.K, width, height)
+            fill = (face < 0) & (behind >= 0)
+            face, depth = np.where(fill, soft[behind], face), np.where(fill, far, depth)
+        support = np.where(face >= 0, self._owner[face], np.uint8(0))
+        if not (face >= 0).any():
+            return Silhouettes(support, support)
+        distance, index = _nearest(face >= 0)
+        focal = float(self._camera.K[0, 0])
+        near_face, near_depth = face.reshape(-1)[index], depth.reshape(-1)[index]
+        within = distance * near_depth / focal <= self._margin[near_face]
+        nearest = np.where((face >= 0) | within, self._owner[near_face], np.uint8(0))
+        return Silhouettes(support, nearest)
+
+    def cut(self, matte: np.ndarray, silhouettes: Silhouettes, threshold: int) -> np.ndarray:
+        """Labels uint8 `[H, W]` of the foreground of one grey matte, not yet cleaned."""
+        return np.where(threshold_matte(matte, threshold), silhouettes.nearest, np.uint8(0))
+
+
+def merge_labels(images: Mapping[str, np.ndarray]) -> np.ndarray:
+    """One label image from bool masks by part name; where masks overlap the later part of `PARTS` wins."""
+    shape = next(iter(images.values())).shape
+    label = np.zeros(shape, dtype=np.uint8)
+    for name in PARTS:
+        if name in images:
+            label[images[name]] = LABELS[name]
+    return label
+
+
+def _border(rest: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """The longest open border, the neck's or the wrist's, as a loop of vertex ids."""
+    loops = [loop for loop in boundary_loops(faces) if len(loop) >= 6]
+    if not loops:
+        return None
+    lengths = [np.linalg.norm(rest[loop] - rest[np.roll(loop, 1)], axis=1).sum() for loop in loops]
+    return np.asarray(loops[int(np.argmax(lengths))])
+
+
+def _scalp(rest: np.ndarray, faces: np.ndarray, border: np.ndarray | None) -> np.ndarray:
+    """How much of the hair's margin each face gets, 0 at the open border to 1 at the far half of the part.
+
+    Height is measured along the axis from the border to the centroid, so no knowledge of the topology is used.
+    """
+    centres = rest[faces].mean(axis=1)
+    if border is None:
+        return np.ones(len(faces))
+    axis = rest.mean(axis=0) - rest[border].mean(axis=0)
+    heights = (centres - rest[border].mean(axis=0)) @ axis / max(float(axis @ axis), 1e-12)
+    return np.clip((heights - 0.5) / 0.5, 0.0, 1.0)
+
+
+def _extrude(verts: np.ndarray, border: np.ndarray, length: float, flare: float) -> np.ndarray:
+    """Rings `[_RINGS * L, 3]` that continue a border outwards, growing by `flare` per length."""
+    ring = verts[border]
+    centre = ring.mean(axis=0)
+    normal = np.linalg.svd(ring - centre, full_matrices=False)[2][2]
+    if normal @ (verts.mean(axis=0) - centre) > 0:
+        normal = -normal
+    radius = max(float(np.linalg.norm(ring - centre, axis=1).mean()), 1e-6)
+    steps = np.linspace(0.0, 1.0, _RINGS) * length
+    rings = [centre + normal * step + (ring - centre) * (1 + flare * step / radius) for step in steps]
+    return np.concatenate(rings)
+
+
+def _strips(count: int) -> np.ndarray:
+    """Triangles between consecutive rings of `count` vertices."""
+    a = np.arange(count)
+    b = (a + 1) % count
+    quads = [np.stack([a, b, b + count, a + count], axis=1) + ring * count for ring in range(_RINGS - 1)]
+    quad = np.concatenate(quads)
+    return np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
+
+
+def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance [px] to, and flat index of, the nearest true pixel of a bool image."""
+    away = np.where(mask, np.uint8(0), np.uint8(1))
+    distance, tag = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    index = np.zeros(int(tag.max()) + 1, dtype=np.int64)
+    index[tag[mask]] = np.flatnonzero(mask)
+    return distance, index[tag]
