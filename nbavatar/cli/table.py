@@ -1,0 +1,91 @@
+"""One table of the paper: printed numbers, reproduced numbers, their difference.
+
+    --table      name of the table in the layout: novel_view_1024, self_reenactment_1024, interactavatar_512, ablation,
+                 channels, speed, cameras
+    --layout     config/tables.yaml: rows, columns, protocols
+    --reported   config/reported.csv: every number the paper prints
+    --evals      results of `nbavatar evaluate` (.json); those of other rows are ignored, missing ones show as missing
+    --speeds     results of `nbavatar speed` (.json)
+    --out-stem   STEM.csv (one line a cell, with its source), STEM.md and STEM.tex are written
+
+Results of another image size than the paper's, and all of them with --size-label, stand under a heading that says so.
+"""
+
+import argparse
+from pathlib import Path
+
+from nbavatar.cli.common import add_cfg_argument, stage_config
+from nbavatar.config.core import to_mapping
+from nbavatar.config.evaluation import TableConfig
+from nbavatar.config.tables import choose_table, read_tables
+from nbavatar.errors import DataError
+from nbavatar.io.atomic import atomic_write
+from nbavatar.io.records import read_json
+from nbavatar.provenance import file_digest, run_record
+from nbavatar.reporting.cells import Source, Table
+from nbavatar.reporting.formats import to_csv, to_latex, to_markdown
+from nbavatar.reporting.printed import read_printed
+from nbavatar.reporting.tables import Result, build_table, index_results
+
+__all__ = ["add_arguments", "main", "read_results"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the options of `nbavatar table`."""
+    parser.add_argument("--table", required=True, metavar="NAME", help="which table")
+    parser.add_argument("--layout", default="config/tables.yaml", metavar="YAML", help="layout of the tables")
+    parser.add_argument("--reported", default="config/reported.csv", metavar="CSV", help="numbers printed in the paper")
+    parser.add_argument("--evals", nargs="*", default=[], metavar="JSON", help="evaluations")
+    parser.add_argument("--speeds", nargs="*", default=[], metavar="JSON", help="timings")
+    parser.add_argument("--size-label", default="", metavar="TEXT", help="why no result is comparable with the paper")
+    parser.add_argument("--out-stem", required=True, metavar="STEM", help="where to write, without suffix")
+    add_cfg_argument(parser, TableConfig)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Writes one table in three formats and prints it."""
+    cfg = stage_config(args, TableConfig)
+    layout = choose_table(read_tables(args.layout), args.table, args.layout)
+    files = [*args.evals, *args.speeds]
+    inputs = {"layout": args.layout, "reported": args.reported} | {f"results.{i}": path for i, path in enumerate(files)}
+    table = build_table(
+        args.table,
+        layout,
+        _read_printed(args.reported),
+        index_results(read_results(files)),
+        printed_source=Source(args.reported, file_digest(args.reported)),
+        lpips_net=cfg.lpips_net,
+        size_label=args.size_label,
+    )
+    record = run_record("table", config={"table": args.table} | to_mapping(cfg), inputs=inputs)
+    table = Table(**{**vars(table), "record": record})
+    for suffix, write in (("csv", to_csv), ("md", to_markdown), ("tex", to_latex)):
+        with atomic_write(f"{args.out_stem}.{suffix}") as path:
+            path.write_text(write(table), encoding="utf-8")
+    print(f"{args.out_stem}.md written")
+    return 0
+
+
+def read_results(paths: list[str]) -> list[Result]:
+    """Reads evaluations and timings, each with its source.
+
+    A timing does not say whose it is; its place, ``<subject>/<variant>.json``, does.
+    """
+    results = []
+    for path in paths:
+        content = read_json(path)
+        if not isinstance(content, dict):
+            raise DataError.of(path, expected="a result of nbavatar evaluate or speed", found="another JSON file")
+        content = {"subject": Path(path).parent.name, "variant": Path(path).stem} | content
+        size = content.get("size") or content.get("speed", {}).get("size")
+        source = Source(path, file_digest(path), content.get("protocol_hash", ""), tuple(size) if size else None)
+        results.append((content, source))
+    return results
+
+
+def _read_printed(path: str) -> dict:
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise DataError.of(path, expected="the numbers printed in the paper (.csv)", found="no such file") from error
+    return read_printed(lines, path)

@@ -1,0 +1,97 @@
+"""Sentences under a table: protocol, sizes, devices, and where the paper does not agree with itself."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from nbavatar.config.tables import Panel, TableLayout
+from nbavatar.reporting.cells import COLUMNS, Source
+from nbavatar.reporting.printed import Printed, deviating_marks, deviating_means
+
+__all__ = ["describe_deviations", "describe_protocol", "describe_speeds"]
+
+_SPLITS = {
+    "novel_view": "training frames in the held-out camera",
+    "self_reenactment": "held-out frames in the training cameras",
+    "all": "all frames",
+}
+_NETS = {"alex": "AlexNet", "vgg": "VGG16"}
+_MARKS = {"best": "bold", "second": "underlined", "": "unmarked"}
+
+
+def describe_protocol(panel: Panel, results: Sequence[tuple[Mapping[str, Any], Source]], lpips_net: str) -> list[str]:
+    """One sentence for each protocol that the results were made under, and one with the trivial answers."""
+    if not results:
+        return [f"No results under protocol {panel.protocol} yet."]
+    by_hash: dict[str, list[Mapping[str, Any]]] = {}
+    for result, _ in results:
+        by_hash.setdefault(result["protocol_hash"], []).append(result)
+    sentences = []
+    for digest, group in sorted(by_hash.items()):
+        protocol = group[0]["protocol"]
+        sizes = sorted({tuple(result["size"]) for result in group})
+        colour = protocol["background"]
+        ground = {(1.0, 1.0, 1.0): "white", (0.0, 0.0, 0.0): "black"}.get(tuple(map(float, colour)), str(colour))
+        frames = sorted({f"{r['subject']} {r['count']} images, frames {r['frames']}" for r in group})
+        sentences.append(
+            f"Protocol {protocol['name']} ({digest}): {_SPLITS[protocol['split']]}, crop {protocol['crop']}, "
+            f"{', '.join(f'{w} x {h}' for w, h in sizes)} px, {ground} background, {protocol['precision']}; "
+            f"LPIPS by {_NETS[lpips_net]} (the paper names no backbone); {'; '.join(frames)}."
+        )
+    trivial = _describe_trivial([result for result, _ in results])
+    return sentences + ([trivial] if trivial else [])
+
+
+def _describe_trivial(results: Sequence[Mapping[str, Any]]) -> str:
+    """PSNR of the trivial answers, by subject."""
+    names = {"background": "background only", "mean_image": "mean training image"}
+    by_subject: dict[str, str] = {}
+    for result in results:
+        values = [
+            f"{names[answer]} {metrics['psnr']:.2f}"
+            for answer, metrics in (result.get("trivial") or {}).items()
+            if metrics.get("psnr") is not None
+        ]
+        if values:
+            by_subject.setdefault(str(result["subject"]), ", ".join(values))
+    if not by_subject:
+        return ""
+    return "PSNR of the trivial answers: " + "; ".join(f"{s} {text}" for s, text in sorted(by_subject.items())) + "."
+
+
+def describe_speeds(results: Sequence[tuple[Mapping[str, Any], Source]]) -> list[str]:
+    """Devices and sizes of timings."""
+    if not results:
+        return ["No timings yet."]
+    seen = []
+    for result, source in results:
+        size = f", {source.size[0]} x {source.size[1]} px" if source.size else ""
+        count = result["speed"].get("billboards")
+        seen.append(f"{result.get('device') or 'an unknown device'}{size}" + (f", {count} billboards" if count else ""))
+    return ["Timings reproduced on " + "; ".join(dict.fromkeys(seen)) + " (the paper: 1024 x 1024 px, on an RTX 4090)."]
+
+
+def describe_deviations(
+    layout: TableLayout, panel: Panel, printed: Mapping[tuple[str, str, str], Printed]
+) -> list[str]:
+    """Where means and marks that are recomputed from the paper's printed cells differ from what it prints."""
+    if layout.kind == "cameras":
+        return []
+    place = f" ({panel.title})" if panel.title else ""
+    sentences = []
+    means = deviating_means(printed, panel.reported, layout.subjects)
+    if means:
+        items = [f"{row} {COLUMNS[metric].heading} {text} (cells give {mean:f})" for row, metric, text, mean in means]
+        sentences.append(f"Printed means that the printed cells do not give{place}: {'; '.join(items)}.")
+    elif layout.kind == "subjects":
+        sentences.append("All printed means follow from the printed cells within rounding.")
+    if layout.ranked:
+        marks = deviating_marks(printed, panel.reported, second=layout.second)
+        items = [
+            f"{row} {column.replace('.', ' ').replace(metric, COLUMNS[metric].heading)} "
+            f"(paper: {_MARKS[theirs]}; digits: {_MARKS[ours]})"
+            for row, column, theirs, ours in marks
+            for metric in [column.rpartition(".")[2]]
+        ]
+        if items:
+            sentences.append(f"Marks of the paper that its printed digits do not give{place}: {'; '.join(items)}.")
+    return sentences
