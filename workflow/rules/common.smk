@@ -1,11 +1,10 @@
 """Sheets, checks, and the functions that rules share. Nothing here computes, and nothing imports torch."""
 
 import json
-import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 from snakemake.exceptions import WorkflowError
-from snakemake.io import Wildcards
 
 from nbavatar.config.run import load_run, stage_options
 from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
@@ -71,7 +70,13 @@ def protocol_options(wildcards):
     )
 
 
+def data_root(wildcards):
+    """Folder of the whole dataset."""
+    return RUN.data_root
+
+
 def root(wildcards):
+    """Folder of one subject's data."""
     return SUBJECTS[wildcards.subject].root
 
 

@@ -55,7 +55,7 @@ rule evaluate:
         " --cfg {params.cfg:q} > {log} 2>&1"
 
 
-# Timing wants the device for itself: it takes every GPU that the profile grants, and every core of a small machine.
+# Timing wants the machine for itself: it takes every core, so no other job of this workflow runs beside it.
 rule speed:
     input:
         model="results/{run}/train/{subject}/{variant}/model.pt",
@@ -65,9 +65,9 @@ rule speed:
         "results/{run}/speed/{subject}/{variant}.json",
     log:
         "logs/{run}/speed/{subject}/{variant}.log",
-    threads: workflow.cores
+    threads: workflow.cores or 4
     resources:
-        gpu=workflow.global_resources.get("gpu", 1),
+        gpu=1,
         mem="16GB",
         runtime="30m",
     params:

@@ -14,12 +14,12 @@ if RUN.synthetic:
                 for s in SUBJECTS
                 for path in dict.fromkeys(
                     [
-                        *raw_tracks(Wildcards(fromdict={"subject": s})),
+                        *raw_tracks(SimpleNamespace(subject=s)),
                         *(
                             path
                             for c in SUBJECTS[s].cameras
                             for path in raw_files(
-                                Wildcards(fromdict={"subject": s, "camera": c})
+                                SimpleNamespace(subject=s, camera=c)
                             )
                         ),
                     ]
@@ -30,7 +30,7 @@ if RUN.synthetic:
         params:
             cfg=options("synthesize"),
             code=code_digest("synthesize"),
-            root=RUN.data_root,
+            root=data_root,
         shell:
             "nbavatar synthesize --out {params.root} --cfg {params.cfg:q} > {log} 2>&1"
 

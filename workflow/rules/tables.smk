@@ -49,7 +49,7 @@ rule report:
             {
                 path
                 for row in ROWS
-                for path in protocol_frames(Wildcards(fromdict=dict(row.__dict__)))
+                for path in protocol_frames(row)
             }
         ),
         histories=[f"{R}/train/{s}/{v}/history.jsonl" for s, v in avatars()],

@@ -1,0 +1,65 @@
+"""A copy of the project whose commands are stubs: the plan is tested, nothing is computed."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+# Creates whatever a rule's command is asked to write, and does nothing else.
+STUB = """#!/bin/sh
+while [ $# -gt 0 ]; do
+  case "$1" in
+    --out|--csv|--sheet|--exr|--picture|--history|--validate) mkdir -p "$(dirname "$2")"; echo made > "$2" ;;
+    --out-stem) mkdir -p "$(dirname "$2")"; for s in csv md tex; do echo made > "$2.$s"; done ;;
+  esac
+  shift
+done
+"""
+
+
+class Project:
+    """A project folder and ways to plan and run its workflow."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        for name in ("nbavatar", "workflow", "config", "profiles"):
+            ignored = shutil.ignore_patterns("__pycache__", "assets", "*.nbi", "*.nbc")
+            shutil.copytree(ROOT / name, folder / name, ignore=ignored)
+        shutil.copy(ROOT / "Snakefile", folder)
+        (folder / "bin").mkdir()
+        stub = folder / "bin" / "nbavatar"
+        stub.write_text(STUB)
+        stub.chmod(0o755)
+        self.environment = dict(os.environ)
+        self.environment["PATH"] = f"{folder / 'bin'}{os.pathsep}{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        self.environment["PYTHONPATH"] = str(folder)
+
+    def snakemake(self, *words: str, config: str = "config/smoke.yaml") -> subprocess.CompletedProcess[str]:
+        """Runs snakemake in the folder."""
+        command = [sys.executable, "-m", "snakemake", "--cores", "2", "--configfile", config, *words]
+        return subprocess.run(
+            command, cwd=self.folder, env=self.environment, capture_output=True, text=True, timeout=300
+        )
+
+    def plan(self, *words: str, config: str = "config/smoke.yaml") -> dict[str, int]:
+        """Rule -> number of jobs that a dry run would start."""
+        done = self.snakemake("-n", *words, config=config)
+        text = done.stdout + done.stderr
+        assert done.returncode == 0, text[-3000:]
+        if "Nothing to be done" in text:
+            return {}
+        table = re.search(r"^job +count\n[- ]+\n(.*?)^total", text, re.S | re.M)
+        assert table, text[-3000:]
+        counts = {name: int(count) for name, count in (line.split() for line in table[1].splitlines() if line.strip())}
+        return {name: count for name, count in counts.items() if name != "all"}
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """A fresh copy of the project for one test module."""
+    return Project(tmp_path_factory.mktemp("project") / "p")

@@ -1,0 +1,120 @@
+"""What the workflow plans, from nothing."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+SMOKE = {
+    "synthesize": 1, "ingest": 4, "tracks": 1, "masks": 4, "crop": 8, "fit": 1, "spectral": 1, "deform": 1,
+    "train": 10, "render": 12, "evaluate": 12, "speed": 4, "table": 7, "report": 1,
+}  # fmt: skip
+
+
+def test_default_target_is_everything_and_not_nothing(project):
+    assert project.plan() == SMOKE
+
+
+def test_one_subject_one_table_one_stage_can_be_asked_for(project):
+    subject = project.plan("subject_S2")
+    assert subject.pop("subject_S2") == 1
+    assert subject == {name: count for name, count in SMOKE.items() if name not in ("speed", "table", "report")}
+    table = project.plan("table_ablation")
+    assert table["table"] == 1
+    assert table["train"] == 6  # full, no_nb, no_reg, no_dnr, no_pbd, no_spectral
+    assert "speed" not in table
+    stage = project.plan("stage_masks")
+    assert {"masks", "ingest", "tracks"} < set(stage)
+    assert "crop" not in stage
+
+
+def _decaf(project, subjects=("S1", "S2", "S3", "S4")):
+    """Empty files in the places of a Decaf folder, as the release splits it."""
+    base = project.folder / "resources/DecafDataset"
+    names = ["assets/generic_model.pkl", "assets/landmark_embedding.npy", "assets/mano_v1_2/models/MANO_RIGHT.pkl"]
+    for subject in subjects:
+        split = "test" if subject in ("S1", "S3") else "train"
+        for camera in ("084", "100", "102", "108", "110", "111", "121", "122"):
+            names += [f"{split}/{kind}/{subject}/{camera}.mp4" for kind in ("videos", "segmentations")]
+            keyed = ("head_keys", "right_hand_keys", "head_bbs", "right_hand_bbs")
+            names += [f"{split}/{kind}/{subject}/{camera}.npy" for kind in keyed]
+        names += [
+            f"{split}/cameras/{subject}/cameras.pkl",
+            f"{split}/params/{subject}/params_smoothed.pkl",
+            f"{split}/cutIDs/{subject}.pkl",
+            f"{split}/deformations/{subject}/deforms.npy",
+            f"{split}/contacts/{subject}/contacts_head.npy",
+            f"{split}/contacts/{subject}/contacts_rh.npy",
+        ]
+    for name in names:
+        path = base / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("raw")
+
+
+def test_the_whole_paper_is_planned(project):
+    _decaf(project)
+    plan = project.plan(config="config/paper.yaml")
+    assert plan == {
+        "ingest": 32, "tracks": 4, "masks": 32, "crop": 64, "fit": 4, "spectral": 4, "deform": 4,
+        "train": 16, "render": 24, "evaluate": 24, "speed": 4, "table": 7, "report": 1,
+    }  # fmt: skip
+
+
+def test_subjects_are_found_in_both_split_folders(project):
+    _decaf(project)
+    reasons = project.snakemake("-n", "stage_tracks", config="config/paper.yaml").stdout
+    for subject, split in (("S1", "test"), ("S2", "train"), ("S3", "test"), ("S4", "train")):
+        assert f"DecafDataset/{split}/params/{subject}/params_smoothed.pkl" in reasons
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--config", "stages={train: {step: 3}}"), "unknown key 'step'; did you mean 'steps'"),
+        (("--config", "run=a/b"), "config.run"),
+        (("--config", "device=gpu"), "one of auto, cpu, cuda"),
+        (("--config", "runs=config/none.tsv"), "config/none.tsv: expected a sheet"),
+    ],
+)
+def test_configuration_errors_are_one_line_before_any_job(project, words, message):
+    config = yaml.safe_load((project.folder / "config/smoke.yaml").read_text())
+    assert config["run"] == "smoke"
+    out = project.snakemake("-n", *words)
+    assert out.returncode != 0
+    text = out.stdout + out.stderr
+    assert message in text
+    assert "Traceback" not in text
+
+
+def test_unknown_subject_is_named(project):
+    sheet = project.folder / "config/bad.tsv"
+    sheet.write_text("subject\tvariant\tprotocol\nS9\tfull\tnv1024\n")
+    out = project.snakemake("-n", "--config", "runs=config/bad.tsv")
+    assert out.returncode != 0
+    assert "unknown subject 'S9'" in out.stdout + out.stderr
+    target = project.snakemake("-n", "subject_S9")
+    assert target.returncode != 0
+
+
+def test_capture_without_a_folder_says_which_option_to_give(project):
+    out = project.snakemake("-n", config="config/capture.yaml")
+    assert out.returncode != 0
+    assert "--config data_root=" in out.stdout + out.stderr
+
+
+def test_lint_is_clean(project):
+    out = project.snakemake("--lint")
+    assert out.returncode == 0, out.stdout + out.stderr
+
+
+def test_planning_imports_nothing_heavy(project):
+    out = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "snakemake", "-n", "--cores", "1", "--configfile", "config/smoke.yaml"],
+        cwd=project.folder, env=project.environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert out.returncode == 0
+    imported = set(re.findall(r"\| +(\w+)$", out.stderr, re.M))
+    assert not imported & {"torch", "numba", "cv2", "igl"}
