@@ -1,0 +1,1 @@
+"""Triangle meshes: topology, face frames, Laplacians, spectral coordinates, silhouettes."""
