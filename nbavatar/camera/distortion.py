@@ -1,8 +1,8 @@
 """Lens distortion in OpenCV's rational model, and maps that remove it.
 
-`x_d = x (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6) + 2 p1 x y + p2 (r2 + 2 x2) + s1 r2 + s2 r4`, and alike
-for y with p1 and p2, s3 and s4 in their place; coefficients in OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]].
-Coordinates x, y are those of the plane z = 1 of the camera. Tilted sensors (14 coefficients) are refused.
+`x_d = x (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6) + 2 p1 x y + p2 (r2 + 2 x2) + s1 r2 + s2 r4`, and
+alike for y with p1 and p2, s3 and s4 in their place; coefficients in OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2
+s3 s4]]]. Coordinates x, y are those of the plane z = 1 of the camera. Tilted sensors (14 coefficients) are refused.
 """
 
 import numpy as np
@@ -141,8 +141,9 @@ def distort_vertices(points: np.ndarray, distortion: np.ndarray | None, reach: f
     Args:
         points: `[V, 3]` in camera axes [m]; those behind the camera stay as they are.
         distortion: coefficients, or None.
-        reach: radius in the plane z = 1 up to which the lens model is trusted (that of the farthest image corner); beyond,
-            the displacement at that radius is kept in proportion, so that the model cannot fold points back into view.
+        reach: radius in the plane z = 1 up to which the lens model is trusted (that of the farthest image corner);
+            beyond, the displacement at that radius is kept in proportion, so that the model cannot fold points back
+            into view.
 
     Returns:
         `[V, 3]`, depth unchanged.

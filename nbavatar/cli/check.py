@@ -1,11 +1,11 @@
 """Validate a capture, or a Decaf folder, before any time is spent on it.
 
-  nbavatar check CAPTURE [--out DIR]            reads every file of a capture (cameras.json, images, masks, alpha, meshes,
-                                                splits.json), prints one line per defect and ends with exit code 2 if there
-                                                is any. With --out, writes DIR/CAMERA.png, the meshes over that camera's images
-                                                with the outline of the masks in yellow, and DIR/overview.png: look at them.
-  nbavatar check --layout decaf ROOT            lists in one message which files of the dataset and of the body models are
-                                                missing, where to get them and where to put them.
+  nbavatar check CAPTURE [--out DIR]      reads every file of a capture (cameras.json, images, masks, alpha, meshes,
+                                          splits.json), prints one line per defect and ends with exit code 2 if there
+                                          is any. With --out, writes DIR/CAMERA.png, the meshes over that camera's
+                                          images with the masks outlined in yellow, and DIR/overview.png: look at them.
+  nbavatar check --layout decaf ROOT      lists in one message which files of the dataset and of the body models are
+                                          missing, where to get them and where to put them.
 
 Lengths are metres, cameras map world to camera (OpenCV axes), pixel centres lie at +0.5.
 """
@@ -34,7 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
     parser.add_argument("path", metavar="PATH", help="folder of the capture, or of the Decaf dataset")
     parser.add_argument("--layout", choices=("capture", "decaf"), default="capture", help="how the folder is laid out")
-    parser.add_argument("--subjects", nargs="+", default=["S1", "S2", "S3", "S4"], help="decaf: subjects that are needed")
+    parser.add_argument(
+        "--subjects", nargs="+", default=["S1", "S2", "S3", "S4"], help="decaf: subjects that are needed"
+    )
     parser.add_argument("--cameras", nargs="+", default=list(CAMERAS), help="decaf: cameras that are needed")
     parser.add_argument("--out", metavar="DIR", help="capture: folder for overlays")
 

@@ -1,15 +1,15 @@
 """Training images of one camera: lens distortion removed, cropped to a square, resized.
 
-Reads the frame packs of `nbavatar ingest` (rgb) and `nbavatar masks` (label, alpha; without --masks they are taken from the
-first), and for box crops the mesh sequence with the tracked boxes. Writes a frame pack:
+Reads the frame packs of `nbavatar ingest` (rgb) and `nbavatar masks` (label, alpha; without --masks they are taken
+from the first), and for box crops the mesh sequence with the tracked boxes. Writes a frame pack:
 
   rgb       uint8 [S, S, 3]   sRGB
   label     uint8 [S, S]      0 background, 1 head, 2 right hand, 3 left hand
   alpha     uint8 [S, S]      coverage; 0 where the crop sticks out of the native image
 
 with K [px] of the cropped images (K_per_frame where boxes move), distortion null, and everything else as it was.
-Kinds: `center`, the largest centred square (the paper's 1024 protocol); `box`, a square over the tracked head and hand over
-the whole sequence, with a margin (the paper's 512 protocol), or per frame; `full`, the whole frame.
+Kinds: `center`, the largest centred square (the paper's 1024 protocol); `box`, a square over the tracked head and hand
+over the whole sequence, with a margin (the paper's 512 protocol), or per frame; `full`, the whole frame.
 """
 
 import argparse

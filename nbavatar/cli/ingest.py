@@ -12,9 +12,9 @@ and writes a frame pack (zip of PNGs and manifest.json, see `nbavatar.io.framepa
   label     uint8 [H, W]      0 background, 1 head, 2 right, 3 left hand    } captures with
   alpha     uint8 [H, W]      coverage, 255 = full                          } label masks
 
-The manifest carries K [px, pixel centres at +0.5], cam_from_world [m], distortion, frame ids, train/test split and uncut
-runs. Videos are decoded once, in order, one frame in memory; a frame count that disagrees with any other file of the
-subject ends the command with one line and no output.
+The manifest carries K [px, pixel centres at +0.5], cam_from_world [m], distortion, frame ids, train/test split and
+uncut runs. Videos are decoded once, in order, one frame in memory; a frame count that disagrees with any other file of
+the subject ends the command with one line and no output.
 """
 
 import argparse
@@ -34,9 +34,13 @@ __all__ = ["add_arguments", "main"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
-    parser.add_argument("--layout", choices=("decaf", "capture"), required=True, help="how the input folder is laid out")
+    parser.add_argument(
+        "--layout", choices=("decaf", "capture"), required=True, help="how the input folder is laid out"
+    )
     parser.add_argument("--root", required=True, metavar="DIR", help="dataset or capture folder")
-    parser.add_argument("--subject", required=True, help="subject, such as S2 (for captures: any name, kept in the record)")
+    parser.add_argument(
+        "--subject", required=True, help="subject, such as S2 (for captures: any name, kept in the record)"
+    )
     parser.add_argument("--camera", required=True, help="camera id, such as 084")
     parser.add_argument("--out", required=True, metavar="ZIP", help="frame pack to write")
     add_cfg_argument(parser, IngestConfig)
@@ -62,7 +66,13 @@ def main(args: argparse.Namespace) -> None:
         layers = capture_layers(capture, camera, plan)
         images = capture_images(capture, camera, plan, layers)
         inputs = {name: capture.root / name for name in ("cameras.json", "splits.json")}
-    extra = {"layout": args.layout, "subject": args.subject, "camera": args.camera, "source_frames": plan.count, **report}
+    extra = {
+        "layout": args.layout,
+        "subject": args.subject,
+        "camera": args.camera,
+        "source_frames": plan.count,
+        **report,
+    }
     record = run_record("ingest", config=to_mapping(cfg), inputs=inputs, extra=extra)
     meanings = {name: LAYERS[name] for name in layers}
     manifest = manifest_of(plan, camera, stage="ingest", subject=args.subject, layers=meanings, record=record)

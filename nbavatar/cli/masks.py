@@ -1,7 +1,7 @@
 """Head and hand masks of one camera: the person's matte, cut by the posed meshes and cleaned.
 
-Reads a frame pack with `person` (a matte of the whole person, 0..255) or `label` masks, and a mesh sequence (.npz) with the
-same frames; or masks of your own (--supplied, or `supplied` in --cfg): FOLDER/[SUBJECT/]CAMERA/FRAME.png or
+Reads a frame pack with `person` (a matte of the whole person, 0..255) or `label` masks, and a mesh sequence (.npz)
+with the same frames; or masks of your own (--supplied, or `supplied` in --cfg): FOLDER/[SUBJECT/]CAMERA/FRAME.png or
 FOLDER/[SUBJECT/]CAMERA.mp4, with labels 0..3 or with 0 and 255.
 
 Writes a frame pack of the same frames, size and camera (still distorted):
@@ -9,8 +9,8 @@ Writes a frame pack of the same frames, size and camera (still distorted):
   label     uint8 [H, W]      0 background, 1 head with neck and hair, 2 right hand, 3 left hand (above the wrist)
   alpha     uint8 [H, W]      coverage, 255 = full
 
-Whatever is neither head nor hand (torso, arms) becomes background. Holes and islands that the meshes contradict are repaired,
-and so is what flickers in single frames. The record counts the pixels that each repair changed.
+Whatever is neither head nor hand (torso, arms) becomes background. Holes and islands that the meshes contradict are
+repaired, and so is what flickers in single frames. The record counts the pixels that each repair changed.
 """
 
 import argparse
@@ -38,7 +38,9 @@ __all__ = ["add_arguments", "main"]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
     parser.add_argument("--frames", required=True, metavar="ZIP", help="frame pack of `nbavatar ingest`")
-    parser.add_argument("--meshes", required=True, metavar="NPZ", help="mesh sequence of `nbavatar tracks` (or fit, deform)")
+    parser.add_argument(
+        "--meshes", required=True, metavar="NPZ", help="mesh sequence of `nbavatar tracks` (or fit, deform)"
+    )
     parser.add_argument("--supplied", metavar="DIR", help="masks of your own, instead of those in the frame pack")
     parser.add_argument("--out", required=True, metavar="ZIP", help="frame pack to write")
     add_cfg_argument(parser, MasksConfig)

@@ -2,8 +2,8 @@
 
 Reads, by --layout,
 
-  decaf     ROOT/{train,test}/params/S/params_smoothed.pkl, head_keys, right_hand_keys, head_bbs, right_hand_bbs, contacts,
-            deformations, cameras, cutIDs and ROOT/assets with FLAME (generic_model.pkl) and MANO (MANO_RIGHT.pkl)
+  decaf     ROOT/{train,test}/params/S/params_smoothed.pkl, head_keys, right_hand_keys, head_bbs, right_hand_bbs,
+            contacts, deformations, cameras, cutIDs and ROOT/assets with FLAME (generic_model.pkl) and MANO (MANO_RIGHT.pkl)
   capture   ROOT/cameras.json, meshes/topology.npz, meshes/FRAME.npz, splits.json
 
 and writes a mesh sequence (.npz, see `nbavatar.data.sequences`):
@@ -12,8 +12,9 @@ and writes a mesh sequence (.npz, see `nbavatar.data.sequences`):
   PART.faces int64 [F, 3]     PART.rest float32 [V, 3] [m]     PART.verts float32 [N, V, 3] [m, world]
   extras                      parameters, keypoints, boxes, contacts, cameras, split, segments
 
-Everything is checked on the way: frame counts of all files, numbers that are not finite, shape parameters that change over
-time, stored head poses that contradict the parameters. The first defect ends the command with one line and no output.
+Everything is checked on the way: frame counts of all files, numbers that are not finite, shape parameters that change
+over time, stored head poses that contradict the parameters. The first defect ends the command with one line and no
+output.
 """
 
 import argparse
@@ -37,10 +38,16 @@ __all__ = ["add_arguments", "main"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
-    parser.add_argument("--layout", choices=("decaf", "capture"), required=True, help="how the input folder is laid out")
+    parser.add_argument(
+        "--layout", choices=("decaf", "capture"), required=True, help="how the input folder is laid out"
+    )
     parser.add_argument("--root", required=True, metavar="DIR", help="dataset or capture folder")
-    parser.add_argument("--subject", required=True, help="subject, such as S2 (for captures: any name, kept in the record)")
-    parser.add_argument("--cameras", nargs="*", default=None, help="cameras whose keypoints and boxes to keep; default all")
+    parser.add_argument(
+        "--subject", required=True, help="subject, such as S2 (for captures: any name, kept in the record)"
+    )
+    parser.add_argument(
+        "--cameras", nargs="*", default=None, help="cameras whose keypoints and boxes to keep; default all"
+    )
     parser.add_argument("--out", required=True, metavar="NPZ", help="mesh sequence to write")
     add_cfg_argument(parser, TracksConfig)
 

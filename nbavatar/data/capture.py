@@ -108,7 +108,9 @@ def read_splits(root: Path) -> Splits:
             raise DataError.of(path, name, expected="ids that are in frames", found=f"'{unknown[0]}', which is not")
     both = sorted(set(train) & set(test))
     if both:
-        raise DataError.of(path, "test", expected="frames that are not in train", found=f"'{both[0]}', which is in both")
+        raise DataError.of(
+            path, "test", expected="frames that are not in train", found=f"'{both[0]}', which is in both"
+        )
     if train:
         used = set(train) | set(test)
         frames = [frame for frame in frames if frame in used]

@@ -140,7 +140,9 @@ def _check_meshes(root: Path, report: CaptureReport, found: _Collector) -> dict[
                 size = float(np.linalg.norm(np.ptp(mesh[part], axis=0)))
                 if not low <= size <= high:
                     expected = f"a size of {low} to {high} m"
-                    error = DataError.of(path, part, expected=expected, found=f"{size:.3g}", fix="lengths must be metres")
+                    error = DataError.of(
+                        path, part, expected=expected, found=f"{size:.3g}", fix="lengths must be metres"
+                    )
                     found.note(f"size {part}", str(error))
         meshes[frame] = mesh
     if meshes:
@@ -190,13 +192,17 @@ def _check_camera(
             overlaps.append(_overlap(camera, report.topology, meshes[frame], mask[1]))
     missing = [frame for frame, kind in kinds.items() if kind == "none"]
     if missing and len(missing) < len(kinds):
-        found.note(f"no mask {name}", f"{masks_folder / missing[0]}.png: expected a mask, found none ({len(missing)} missing)")
+        found.note(
+            f"no mask {name}", f"{masks_folder / missing[0]}.png: expected a mask, found none ({len(missing)} missing)"
+        )
     elif missing and not any(covered.values()):
         line = DataError.of(masks_folder, expected="a mask (or an alpha image) for each frame", found="none")
         found.note(f"no mask {name}", str(line))
     if any(covered.values()) and not all(covered.values()):
         lost = next(frame for frame, there in covered.items() if not there)
-        line = DataError.of(capture.root / "alpha" / name / f"{lost}.png", expected="alpha for all frames or none", found="none")
+        line = DataError.of(
+            capture.root / "alpha" / name / f"{lost}.png", expected="alpha for all frames or none", found="none"
+        )
         found.note(f"no alpha {name}", str(line))
     if {"label", "person"} <= set(kinds.values()):
         expected, grey = "labels 0..3 in all masks, or 0..255 in all", sum(k == "person" for k in kinds.values())

@@ -1,7 +1,7 @@
 """A capture's tracked meshes as a mesh sequence.
 
-Extras, besides those of `sequences`: `camera.<camera>.*`, `split`, `segments` as for Decaf, and where the capture stores
-heads without contact, `head_rigid` and `head_final` float32 [N, V, 3] [m], whichever of the two the heads are.
+Extras, besides those of `sequences`: `camera.<camera>.*`, `split`, `segments` as for Decaf, and where the capture
+stores heads without contact, `head_rigid` and `head_final` float32 [N, V, 3] [m], whichever of the two the heads are.
 """
 
 from collections.abc import Sequence

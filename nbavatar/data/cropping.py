@@ -143,5 +143,3 @@ def _mesh_box(sequence: MeshSequence, camera: Camera, row: int) -> np.ndarray:
         pixels = np.clip(pixels, 0, [camera.width, camera.height])
     box = union_box(np.concatenate([pixels, pixels], axis=1)) if len(pixels) else np.full(4, np.nan)
     return box if box[2] > box[0] and box[3] > box[1] else np.full(4, np.nan)
-
-

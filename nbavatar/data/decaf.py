@@ -215,7 +215,9 @@ def read_parameters(subject: DecafSubject) -> dict[str, dict[str, np.ndarray]]:
         size = len(rows[0]) if size is None else size
         for number, row in zip(order, rows):
             if len(row) != size:
-                raise DataError.of(f"{path}: frame {number}", f"{part}.{name}", expected=f"{size} values", found=len(row))
+                raise DataError.of(
+                    f"{path}: frame {number}", f"{part}.{name}", expected=f"{size} values", found=len(row)
+                )
         values = np.stack(rows).astype(np.float32)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(bad):

@@ -1,4 +1,4 @@
-"""Which files of the Decaf dataset and of the body models the paper needs, which are missing, and where they come from."""
+"""Files of the Decaf dataset and of the body models that the paper needs: which are missing, where to get them."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,8 @@
 """Decaf parameters to posed meshes and everything later stages want to know beside them.
 
-Heads are posed RIGIDLY here, that is without the dent of the hand; the release's own dents are kept as reference, already
-turned into world axes and sign, so that `head_with_contact = head + deformation.head`. Extras of the result, besides those
-of `sequences`:
+Heads are posed RIGIDLY here, that is without the dent of the hand; the release's own dents are kept as reference,
+already turned into world axes and sign, so that `head_with_contact = head + deformation.head`. Extras of the result,
+besides those of `sequences`:
 
     param.<part>.<name>            float32 [N, size]     parameters under this package's names
     keypoints.<part>.<camera>      float32 [N, L, 3]     x, y [px, distorted full frame], confidence
@@ -118,7 +118,9 @@ def build_tracks(
             hand_verts.append(mano.forward(r["betas"], r["hand_pose"], r["global_orient"], r["transl"]).verts.numpy())
         zero_expression = torch.zeros(1, head["expression_params"].shape[1])
         head_rest = flame.forward(tensor(own["head"])[None], zero_expression, torch.zeros(1, 3)).verts[0].numpy()
-        hand_rest = mano.forward(tensor(own["right_hand"])[None], torch.zeros(1, 45), torch.zeros(1, 3)).verts[0].numpy()
+        hand_rest = (
+            mano.forward(tensor(own["right_hand"])[None], torch.zeros(1, 45), torch.zeros(1, 3)).verts[0].numpy()
+        )
     parts = {
         "head": Part(flame.faces, head_rest, np.concatenate(head_verts)),
         "right_hand": Part(mano.faces, hand_rest, np.concatenate(hand_verts)),
@@ -191,7 +193,9 @@ def _check_head_poses(
     if not off[worst] <= tolerance:
         expected = "the rotation of head.global_orient in params_smoothed.pkl"
         fix = "parameters and head poses belong to different frames or subjects"
-        raise DataError.of(f"{path}: frame {worst}", expected=expected, found=f"a difference of {off[worst]:.3g}", fix=fix)
+        raise DataError.of(
+            f"{path}: frame {worst}", expected=expected, found=f"a difference of {off[worst]:.3g}", fix=fix
+        )
     return float(off[worst])
 
 
@@ -201,7 +205,10 @@ def _detections(
     result = {}
     for part in KEYPOINTS:
         for name, camera in cameras.items():
-            keys, boxes = read_keypoints(subject, part, name), read_boxes(subject, part, name, camera.width, camera.height)
+            keys, boxes = (
+                read_keypoints(subject, part, name),
+                read_boxes(subject, part, name, camera.width, camera.height),
+            )
             result[f"keypoints.{part}.{name}"] = _rows(keys, subject.file(f"{part}_keys", f"{name}.npy"), count)[frames]
             result[f"boxes.{part}.{name}"] = _rows(boxes, subject.file(f"{part}_bbs", f"{name}.npy"), count)[frames]
     return result

@@ -1,16 +1,16 @@
 """Head and hand cut out of a person's matte by the posed meshes.
 
-The matte knows where the person ends, the meshes know what is head (with neck) and what is hand (above the wrist). Neither
-alone suffices: hair, brows and lips stand off the head's mesh, and the matte holds the torso and both arms.
+The matte knows where the person ends, the meshes know what is head (with neck) and what is hand (above the wrist).
+Neither alone suffices: hair, brows and lips stand off the head's mesh, and the matte holds the torso and both arms.
 
-Every foreground pixel is given to the nearest projected surface: pixels under a mesh to the mesh in front, others to the
-nearest silhouette, if it is within that surface's margin [m]. Margins are wide over the scalp (hair) and narrow along neck,
-jaw and hand. Two kinds of helper surfaces take what is not wanted: a sleeve beyond each wrist, which also hides what
-is behind it, and a collar beyond the neck, which opens like shoulders do and never hides anything. Both are extruded from
-the open border of the part; a part without one (a closed mesh) gets none.
+Every foreground pixel is given to the nearest projected surface: pixels under a mesh to the mesh in front, others to
+the nearest silhouette, if it is within that surface's margin [m]. Margins are wide over the scalp (hair) and narrow
+along neck, jaw and hand. Two kinds of helper surfaces take what is not wanted: a sleeve beyond each wrist, which also
+hides what is behind it, and a collar beyond the neck, which opens like shoulders do and never hides anything. Both are
+extruded from the open border of the part; a part without one (a closed mesh) gets none.
 
-Limits: long hair below the margin is cut; a forearm that bends sharply at the wrist and passes in front of the face beyond
-the sleeve's length counts as head.
+Limits: long hair below the margin is cut; a forearm that bends sharply at the wrist and passes in front of the face
+beyond the sleeve's length counts as head.
 """
 
 import dataclasses
@@ -70,9 +70,7 @@ class PartCutter:
     def __init__(self, sequence: MeshSequence, camera: Camera, margins: Margins) -> None:
         self._sequence, self._camera = sequence, camera
         corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], dtype=np.float64)
-        self._reach = float(
-            np.linalg.norm((corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], axis=1).max() * 1.1
-        )
+        self._reach = float(np.linalg.norm((corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], axis=1).max() * 1.1)
         self._borders: dict[str, np.ndarray] = {}
         faces, owners, reaches, solid = [], [], [], []
         offset = 0

@@ -22,9 +22,7 @@ LAYERS = {
 }
 
 
-def decaf_images(
-    subject: DecafSubject, camera: Camera, plan: FramePlan
-) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+def decaf_images(subject: DecafSubject, camera: Camera, plan: FramePlan) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     """Yields (frame id, {rgb, person}) from the two videos, decoded in step.
 
     Raises:

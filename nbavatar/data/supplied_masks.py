@@ -20,9 +20,9 @@ def supplied_masks(
 ) -> Iterator[np.ndarray]:
     """Yields one uint8 mask `[H, W]` a frame, in order.
 
-    Looked for, in this order: `<folder>/<subject>/<camera>/`, `<folder>/<subject>/<camera>.<video>`, `<folder>/<camera>/`,
-    `<folder>/<camera>.<video>`. An image belongs to the frame of its name, or of the same number with other zero padding.
-    In a video the frame number must be the frame id.
+    Looked for, in this order: `<folder>/<subject>/<camera>/`, `<folder>/<subject>/<camera>.<video>`,
+    `<folder>/<camera>/`, `<folder>/<camera>.<video>`. An image belongs to the frame of its name, or of the same number
+    with other zero padding. In a video the frame number must be the frame id.
 
     Raises:
         DataError: nothing there, a frame without a mask, another size, or a video that is too short.

@@ -15,16 +15,14 @@ def threshold_matte(matte: np.ndarray, threshold: int) -> np.ndarray:
     return cv2.medianBlur(np.ascontiguousarray(matte), 3) > threshold
 
 
-def clean_labels(
-    label: np.ndarray, support: np.ndarray, *, hole_fraction: float, island_fraction: float
-) -> np.ndarray:
+def clean_labels(label: np.ndarray, support: np.ndarray, *, hole_fraction: float, island_fraction: float) -> np.ndarray:
     """Fills holes and removes islands of part labels.
 
     A hole is a background region that touches no image border. It is filled, with what the meshes say, if it is smaller
     than `hole_fraction` of all parts together and lies mostly within the meshes' silhouettes: gaps between fingers or
-    strands are real, holes in a cheek are not. An island is a piece of a part that is not its largest; it is removed if it
-    is smaller than `island_fraction` of the part, unless it lies mostly within the part's own silhouette (a fingertip
-    that is seen beyond another finger).
+    strands are real, holes in a cheek are not. An island is a piece of a part that is not its largest; it is removed
+    if it is smaller than `island_fraction` of the part, unless it lies mostly within the part's own silhouette (a
+    fingertip that is seen beyond another finger).
 
     Args:
         label: uint8 `[H, W]`, 0 = background.
