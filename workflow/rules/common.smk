@@ -80,6 +80,11 @@ def root(wildcards):
     return SUBJECTS[wildcards.subject].root
 
 
+def cameras(wildcards):
+    """Cameras of one subject that the run uses."""
+    return SUBJECTS[wildcards.subject].cameras
+
+
 def split_folder(subject):
     """`train` or `test`: Decaf splits its release by subject."""
     base = Path(SUBJECTS[subject].root)

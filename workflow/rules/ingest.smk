@@ -68,8 +68,9 @@ rule tracks:
     params:
         root=root,
         layout=RUN.layout,
+        cameras=cameras,
         cfg=options("tracks"),
         code=code_digest("tracks"),
     shell:
         "nbavatar tracks --layout {params.layout} --root {params.root:q} --subject {wildcards.subject}"
-        " --out {output} --cfg {params.cfg:q} > {log} 2>&1"
+        " --cameras {params.cameras} --out {output} --cfg {params.cfg:q} > {log} 2>&1"
