@@ -1,0 +1,142 @@
+"""One self-contained HTML page: tables, comparison pictures, training curves, provenance.
+
+    --tables     tables (.md, and .csv to download)
+    --evals      results of `nbavatar evaluate` (.json): figures under the pictures, provenance
+    --renders    frame packs of `nbavatar render`: render, error map and billboard opacity of chosen frames
+    --frames     frame packs of `nbavatar crop`: the truth beside them
+    --histories  training histories (.jsonl), one a trained avatar, in <subject>/<variant>/; previews in
+                 model.pt.state/previews beside them are shown where they exist
+    --pictures   further pictures (.png), such as those of the refit and the contact stage
+    --out        index.html; needs no network and no other file
+
+Every part may be left out; what is not given is not shown.
+"""
+
+import argparse
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from nbavatar.cli.common import add_cfg_argument, stage_config
+from nbavatar.config.evaluation import ReportConfig
+from nbavatar.errors import DataError
+from nbavatar.io.atomic import atomic_write
+from nbavatar.io.framepack import FramePack
+from nbavatar.io.images import decode_image
+from nbavatar.io.records import read_json
+from nbavatar.reporting.comparison import Rendered, comparison_strips
+from nbavatar.reporting.page import (
+    curves_section,
+    page,
+    pictures_section,
+    provenance_section,
+    strips_section,
+    tables_section,
+)
+from nbavatar.reporting.pictures import data_uri, reduce_picture
+
+__all__ = ["add_arguments", "main"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the options of `nbavatar report`."""
+    for name, kind, text in (
+        ("--tables", "FILE", "tables"),
+        ("--evals", "JSON", "evaluations"),
+        ("--speeds", "JSON", "timings"),
+        ("--renders", "ZIP", "rendered images"),
+        ("--frames", "ZIP", "ground-truth crops"),
+        ("--histories", "JSONL", "training histories"),
+        ("--pictures", "PNG", "further pictures"),
+    ):
+        parser.add_argument(name, nargs="*", default=[], metavar=kind, help=text)
+    parser.add_argument(
+        "--size-label", default="", metavar="TEXT", help="why figures are not comparable with the paper"
+    )
+    parser.add_argument("--out", required=True, metavar="HTML", help="page to write")
+    add_cfg_argument(parser, ReportConfig)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Writes the page."""
+    cfg = stage_config(args, ReportConfig)
+    evals = [(path, read_json(path)) for path in args.evals]
+    speeds = [(path, read_json(path)) for path in args.speeds]
+    with ExitStack() as stack:
+        renders = _renders([stack.enter_context(FramePack(path)) for path in args.renders], evals)
+        crops = [stack.enter_context(FramePack(path)) for path in args.frames]
+        strips = comparison_strips(renders, crops, frames=cfg.frames, max_side=cfg.max_side)
+    sections = [
+        ("tables", "Tables", tables_section(_tables(args.tables))),
+        ("pictures", "Comparison with the truth", strips_section(strips) if strips else ""),
+        ("training", "Training", _training(args.histories, cfg)),
+        ("stages", "Geometry", pictures_section([_picture(path, cfg) for path in args.pictures])),
+        ("provenance", "Provenance", provenance_section([*evals, *speeds]) if evals or speeds else ""),
+    ]
+    with atomic_write(args.out) as path:
+        path.write_text(page(cfg.title, args.size_label, sections), encoding="utf-8")
+    print(f"{args.out}: {Path(args.out).stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+def _tables(paths: list[str]) -> dict[str, tuple[str, str]]:
+    texts: dict[str, dict[str, str]] = {}
+    for name in paths:
+        path = Path(name)
+        try:
+            texts.setdefault(path.stem, {})[path.suffix] = path.read_text(encoding="utf-8")
+        except FileNotFoundError as error:
+            raise DataError.of(name, expected="a table (.md or .csv)", found="no such file") from error
+    return {stem: (found.get(".md", ""), found.get(".csv", "")) for stem, found in texts.items()}
+
+
+def _renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[Rendered]:
+    figures: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for _, content in evals:
+        key = (content["subject"], content["variant"], content["protocol"]["name"])
+        figures[key] = {f"{row['camera']}/{row['frame']}": row for row in content["per_image"]}
+    found = []
+    for pack in packs:
+        manifest = pack.manifest
+        config = (manifest.get("record") or {}).get("config") or {}
+        variant = manifest.get("variant") or pack.path.parent.name
+        protocol = config.get("name") or pack.path.stem
+        background = manifest.get("background") or config.get("background") or (1.0, 1.0, 1.0)
+        per_image = figures.get((manifest["subject"], variant, protocol), {})
+        found.append(Rendered(manifest["subject"], variant, protocol, background, pack, per_image))
+    return found
+
+
+def _training(paths: list[str], cfg: ReportConfig) -> str:
+    if not paths:
+        return ""
+    histories: dict[str, list[dict[str, Any]]] = {}
+    previews = []
+    for name in paths:
+        path = Path(name)
+        avatar = "/".join(path.parts[-3:-1])
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+            histories[avatar] = [json.loads(line) for line in lines if line.strip()]
+        except FileNotFoundError as error:
+            raise DataError.of(name, expected="a training history (.jsonl)", found="no such file") from error
+        except json.JSONDecodeError as error:
+            raise DataError.of(
+                name, expected="one JSON object a line", found=f"text that does not parse ({error})"
+            ) from error
+        # The state folder is no output of the workflow and may be gone; its last preview is a welcome extra.
+        pictures = sorted((path.parent / "model.pt.state" / "previews").glob("*.png"))
+        if pictures:
+            title, address, text = _picture(str(pictures[-1]), cfg)
+            previews.append((f"{avatar}: {title}", address, f"Training preview of {avatar}: {text}"))
+    shown = f"<details open><summary>Previews</summary>{pictures_section(previews)}</details>" if previews else ""
+    return curves_section(histories) + shown
+
+
+def _picture(name: str, cfg: ReportConfig) -> tuple[str, str, str]:
+    """Title, embedded picture and alternative text; contact sheets keep three times the side of single pictures."""
+    path = Path(name)
+    title = " ".join(part for part in path.parts[-3:-1] if part not in ("", "/")) + f" {path.stem}"
+    picture = reduce_picture(decode_image(path), 3 * cfg.max_side)
+    return title, data_uri(picture), f"Picture of the stage {title}"

@@ -1,0 +1,110 @@
+"""Comparison strips: truth, every method's render, its error map and its billboards' opacity, frame by frame."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nbavatar.io.framepack import FramePack
+from nbavatar.reporting.page import Card, Strip
+from nbavatar.reporting.pictures import data_uri, error_map, reduce_picture, spread
+
+__all__ = ["Rendered", "comparison_strips", "find_truth"]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """One render: whose it is, its images, and its figures per image (``<camera>/<frame>`` -> metrics)."""
+
+    subject: str
+    variant: str
+    protocol: str
+    background: Sequence[float]
+    pack: FramePack
+    per_image: Mapping[str, Mapping[str, Any]]
+
+
+def find_truth(render: FramePack, name: str, crops: Sequence[FramePack]) -> FramePack | None:
+    """The crop that a rendered frame is compared with: same subject, camera, size and intrinsics; None if not given.
+
+    Args:
+        render: rendered images.
+        name: ``<camera>/<frame>``.
+        crops: ground-truth crops of any cameras and kinds.
+    """
+    camera, _, frame = name.partition("/")
+    size = (render.manifest["width"], render.manifest["height"])
+    own = render.intrinsics(name) if render.manifest.get("K_per_frame") or render.manifest.get("K") else None
+    for crop in crops:
+        manifest = crop.manifest
+        if manifest["subject"] != render.manifest["subject"] or str(manifest["camera"]) != camera:
+            continue
+        if (manifest["width"], manifest["height"]) != size or frame not in crop.frames:
+            continue
+        # float32 on the way through the renderer: a thousandth of a pixel of slack.
+        if own is None or np.allclose(own, crop.intrinsics(frame), atol=1e-3 * max(size)):
+            return crop
+    return None
+
+
+def comparison_strips(
+    renders: Sequence[Rendered], crops: Sequence[FramePack], *, frames: int, max_side: int
+) -> dict[str, list[Strip]]:
+    """Strips by heading (subject and protocol).
+
+    Args:
+        renders: every method's renders, in the order of the columns.
+        crops: ground-truth crops; without the right one a strip has no truth and no error maps.
+        frames: strips per heading, evenly spread over the frames of the first method.
+        max_side: pictures are reduced to this side [px].
+    """
+    groups: dict[str, list[Rendered]] = {}
+    for render in renders:
+        groups.setdefault(f"{render.subject}, protocol {render.protocol}", []).append(render)
+    return {
+        heading: [_strip(name, group, crops, max_side) for name in spread(group[0].pack.frames, frames)]
+        for heading, group in groups.items()
+    }
+
+
+def _strip(name: str, group: Sequence[Rendered], crops: Sequence[FramePack], max_side: int) -> Strip:
+    camera, _, frame = name.partition("/")
+    where = f"camera {camera}, frame {frame}"
+    truth = None
+    cards = []
+    crop = find_truth(group[0].pack, name, crops)
+    if crop is not None:
+        truth = _composite(crop.read("rgb", frame), crop.read("alpha", frame), group[0].background)
+        picture = np.round(truth * 255).astype(np.uint8)
+        cards.append(_card("Ground truth", [(picture, f"Ground truth, {where}")], "", max_side))
+    for render in group:
+        if name not in render.pack.frames:
+            continue
+        rgb = render.pack.read("rgb", name)
+        pictures = [(rgb, f"Render of {render.variant}, {where}")]
+        if truth is not None and truth.shape == rgb.shape:
+            pictures.append((error_map(rgb, truth), f"Error map of {render.variant}, {where}"))
+        if "nb_alpha" in render.pack.layers:
+            mask = render.pack.read("nb_alpha", name)
+            pictures.append((mask, f"Opacity of the billboards of {render.variant}, {where}"))
+        cards.append(_card(render.variant, pictures, _figures(render.per_image.get(name, {})), max_side))
+    return Strip(where, cards)
+
+
+def _card(title: str, pictures: Sequence[tuple[np.ndarray, str]], caption: str, max_side: int) -> Card:
+    small = max(pictures[0][0].shape[:2]) <= 128
+    return Card(title, [(data_uri(reduce_picture(p, max_side)), text) for p, text in pictures], caption, small)
+
+
+def _figures(metrics: Mapping[str, Any]) -> str:
+    """The figures of one image as a short line."""
+    shown = (("psnr", "PSNR", 2), ("ssim", "SSIM", 3), ("lpips_vgg", "LPIPS", 3))
+    words = [f"{word} {metrics[key]:.{digits}f}" for key, word, digits in shown if metrics.get(key) is not None]
+    return ", ".join(words)
+
+
+def _composite(rgb: np.ndarray, alpha: np.ndarray, background: Sequence[float]) -> np.ndarray:
+    """Truth on the protocol's background, float32 [H, W, 3] in [0, 1], as the evaluation composes it."""
+    coverage = alpha.astype(np.float32)[..., None] / np.float32(255)
+    return coverage * (rgb.astype(np.float32) / 255) + (1 - coverage) * np.asarray(background, dtype=np.float32)

@@ -1,0 +1,115 @@
+"""Line charts as SVG text: training curves that follow the page's colours and need no plotting library."""
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+
+__all__ = ["PALETTE", "line_chart", "thin"]
+
+# Okabe and Ito's palette, distinguishable with every kind of colour vision; dashes tell series apart beyond its length.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8A7F00")
+_DASHES = ("", "6 3", "2 3", "8 3 2 3")
+_WIDTH, _HEIGHT = 420, 260
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 12, 30, 44
+
+Series = Mapping[str, Sequence[tuple[float, float]]]
+
+
+def thin(points: Sequence[tuple[float, float]], count: int = 200) -> list[tuple[float, float]]:
+    """At most ``count`` points, each the mean of the points it stands for."""
+    if len(points) <= count:
+        return list(points)
+    edges = [round(i * len(points) / count) for i in range(count + 1)]
+    groups = [points[a:b] for a, b in zip(edges, edges[1:]) if b > a]
+    return [(sum(x for x, _ in g) / len(g), sum(y for _, y in g) / len(g)) for g in groups]
+
+
+def line_chart(title: str, series: Series, *, x_label: str, y_label: str, log_y: bool = False) -> str:
+    """One chart with a legend.
+
+    Args:
+        title: what is shown.
+        series: name -> points (x, y); values that cannot be drawn (not finite, or <= 0 on a log axis) are left out.
+        x_label: horizontal axis, with its unit.
+        y_label: vertical axis, with its unit.
+        log_y: logarithmic vertical axis.
+
+    Returns:
+        An ``<svg>`` element, or an empty text if nothing can be drawn.
+    """
+    drawn = {name: _drawable(points, log_y) for name, points in series.items()}
+    drawn = {name: points for name, points in drawn.items() if points}
+    if not drawn:
+        return ""
+    xs = [x for points in drawn.values() for x, _ in points]
+    ys = [y for points in drawn.values() for _, y in points]
+    x_range = _widened(min(xs), max(xs))
+    y_range = _widened(min(ys), max(ys))
+    rows = math.ceil(len(drawn) / 3)
+    height = _HEIGHT + 16 * rows
+    bottom = _HEIGHT - _BOTTOM
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        across = (x - x_range[0]) / (x_range[1] - x_range[0])
+        up = (y - y_range[0]) / (y_range[1] - y_range[0])
+        return _LEFT + across * (_WIDTH - _LEFT - _RIGHT), bottom - up * (bottom - _TOP)
+
+    text = html.escape(title)
+    spoken = html.escape(f"{title}: {y_label} over {x_label}")
+    parts = [
+        f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{spoken}">',
+        f"<title>{text}</title>",
+        f'<text class="head" x="{_LEFT}" y="18">{text}</text>',
+    ]
+    for tick, name in _ticks(*y_range, log_y):
+        _, y = place(x_range[0], tick)
+        parts.append(f'<path class="grid" d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}"/>')
+        parts.append(f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{name}</text>')
+    for tick, name in _ticks(*x_range, False):
+        x, _ = place(tick, y_range[0])
+        parts.append(f'<path class="grid" d="M{x:.1f} {_TOP}V{bottom}"/>')
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{name}</text>')
+    parts.append(f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2}" y="{bottom + 34}" text-anchor="middle">{x_label}</text>')
+    middle = (_TOP + bottom) / 2
+    parts.append(
+        f'<text transform="translate(14 {middle}) rotate(-90)" text-anchor="middle">{html.escape(y_label)}</text>'
+    )
+    for number, (name, points) in enumerate(drawn.items()):
+        colour = PALETTE[number % len(PALETTE)]
+        dash = _DASHES[number // len(PALETTE) % len(_DASHES)]
+        style = f'stroke="{colour}"' + (f' stroke-dasharray="{dash}"' if dash else "")
+        path = "L".join(f"{x:.1f} {y:.1f}" for x, y in (place(*point) for point in points))
+        if len(points) == 1:
+            x, y = place(*points[0])
+            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colour}"/>')
+        parts.append(f'<path class="line" {style} d="M{path}"><title>{html.escape(name)}</title></path>')
+        x0, y0 = 8 + (number % 3) * (_WIDTH - 8) / 3, _HEIGHT + 4 + 16 * (number // 3)
+        parts.append(f'<path class="line" {style} d="M{x0:.0f} {y0 - 4}h20"/>')
+        parts.append(f'<text x="{x0 + 25:.0f}" y="{y0}">{html.escape(name)}</text>')
+    return "\n".join([*parts, "</svg>"])
+
+
+def _drawable(points: Sequence[tuple[float, float]], log_y: bool) -> list[tuple[float, float]]:
+    good = [(x, y) for x, y in points if math.isfinite(x) and math.isfinite(y) and (y > 0 or not log_y)]
+    return [(x, math.log10(y)) for x, y in good] if log_y else good
+
+
+def _widened(low: float, high: float) -> tuple[float, float]:
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def _ticks(low: float, high: float, log: bool) -> list[tuple[float, str]]:
+    """Round positions inside a range and their labels."""
+    if log and high - low >= 1:
+        first, last = math.ceil(low - 1e-9), math.floor(high + 1e-9)
+        step = max(1, math.ceil((last - first + 1) / 6))
+        return [(float(k), f"{10.0**k:g}") for k in range(first, last + 1, step)]
+    raw = (high - low) / 4
+    unit = 10 ** math.floor(math.log10(raw))
+    step = next(unit * m for m in (1, 2, 5, 10) if unit * m >= raw)
+    first = math.ceil(low / step - 1e-9)
+    values = [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+    return [
+        (v, f"{10**v:.2g}" if log else f"{v:g}" if abs(v) < 1e5 else f"{v / 1000:g}k")
+        for v in (round(v, 12) for v in values)
+    ]

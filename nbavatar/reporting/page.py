@@ -1,0 +1,236 @@
+"""One self-contained HTML page: tables, comparison pictures, training curves, provenance. Text in, text out.
+
+Nothing is fetched: styles, script and pictures are inside. Without JavaScript everything but the sliders works. Colours
+follow the reader's light or dark setting; strips and tables scroll inside the page on narrow screens.
+"""
+
+import base64
+import html
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+from nbavatar.reporting.curves import line_chart, thin
+from nbavatar.reporting.markdown import markdown_to_html
+from nbavatar.reporting.pictures import ERROR_MAX, RAMP
+
+__all__ = ["Card", "Strip", "curves_section", "page", "pictures_section", "provenance_section", "strips_section"]
+__all__ += ["tables_section"]
+
+
+@dataclass(frozen=True)
+class Card:
+    """One column of a strip: its title, pictures (data address, alternative text), caption."""
+
+    title: str
+    pictures: Sequence[tuple[str, str]]
+    caption: str = ""
+    small: bool = False
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One frame: truth first, then every method."""
+
+    title: str
+    cards: Sequence[Card]
+
+
+def tables_section(tables: Mapping[str, tuple[str, str]]) -> str:
+    """Tables from their Markdown, each with its csv to download.
+
+    Args:
+        tables: name -> (Markdown, csv); either may be empty.
+    """
+    parts = []
+    for name, (markdown, table) in tables.items():
+        body = markdown_to_html(markdown)
+        if table:
+            address = "data:text/csv;base64," + base64.b64encode(table.encode()).decode("ascii")
+            link = f'<a download="{_safe(name)}.csv" href="{address}">{_safe(name)}.csv</a>'
+            body += f"\n<p>{link}: every cell with its source</p>"
+        parts.append(f'<section id="table-{_safe(name)}">\n{body}\n</section>')
+    return "\n".join(parts)
+
+
+def strips_section(strips: Mapping[str, Sequence[Strip]]) -> str:
+    """Comparison pictures, by heading; the first strip of each heading also gets a slider."""
+    if not strips:
+        return "<p>No renders were given.</p>"
+    ramp = ", ".join(f"rgb{colour}" for colour in RAMP)
+    parts = [
+        f'<p class="ramp"><span>error 0</span><i style="background: linear-gradient(90deg, {ramp})"></i>'
+        f"<span>{ERROR_MAX:g} and more (mean over RGB of |render - truth|, sRGB in [0, 1])</span></p>"
+    ]
+    number = 0
+    for heading, group in strips.items():
+        parts.append(f"<h3>{html.escape(heading)}</h3>")
+        for i, strip in enumerate(group):
+            cards = []
+            identities = []
+            for card in strip.cards:
+                number += 1
+                cards.append(_card(card, f"picture-{number}"))
+                identities.append((f"picture-{number}", card.title))
+            if i == 0 and len(identities) > 1:
+                parts.append(_slider(identities, strip))
+            parts.append(f"<h4>{html.escape(strip.title)}</h4>")
+            parts.append(f'<div class="strip" tabindex="0" role="region" aria-label="{_safe(strip.title)}">')
+            parts += [*cards, "</div>"]
+    return "\n".join(parts)
+
+
+def _card(card: Card, identity: str) -> str:
+    small = ' class="small"' if card.small else ""
+    images = "".join(
+        f'<img{small} src="{address}" alt="{_safe(text)}"' + (f' id="{identity}"' if i == 0 else "") + ">"
+        for i, (address, text) in enumerate(card.pictures)
+    )
+    caption = f"<b>{html.escape(card.title)}</b>" + (f"<br>{html.escape(card.caption)}" if card.caption else "")
+    return f"<figure>{images}<figcaption>{caption}</figcaption></figure>"
+
+
+def _slider(pictures: Sequence[tuple[str, str]], strip: Strip) -> str:
+    """Two pictures on top of each other; further ones are taken from the strip when the reader chooses them."""
+    left, right = 0, 1
+
+    def choice(side: str, chosen: int) -> str:
+        options = "".join(
+            f'<option value="{identity}"{" selected" if i == chosen else ""}>{html.escape(name)}</option>'
+            for i, (identity, name) in enumerate(pictures)
+        )
+        return f'<select data-side="{side}" aria-label="{side} picture">{options}</select>'
+
+    first, second = strip.cards[left].pictures[0], strip.cards[right].pictures[0]
+    small = ' class="small"' if strip.cards[left].small else ""
+    under = "under small" if strip.cards[left].small else "under"
+    return (
+        '<div class="slider"><div class="stack">'
+        f'<img class="{under}" src="{second[0]}" alt="{_safe(second[1])}">'
+        f'<div class="over"><img{small} src="{first[0]}" alt="{_safe(first[1])}"></div><div class="bar"></div></div>'
+        '<input type="range" min="0" max="100" value="50" aria-label="share of the left picture [%]">'
+        f'<div class="ends">{choice("left", left)}{choice("right", right)}</div></div>'
+    )
+
+
+def curves_section(histories: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Training curves: one chart a logged quantity, one line an avatar.
+
+    Args:
+        histories: avatar -> logged lines, each with ``step`` and numbers.
+    """
+    skipped = {"step", "progress", "skipped", "seconds"}
+    names: dict[str, None] = {}
+    for events in histories.values():
+        for event in events:
+            names.update(dict.fromkeys(k for k, v in event.items() if k not in skipped and _is_number(v)))
+    titles = {
+        "psnr": ("PSNR on the training view", "PSNR [dB]", False),
+        "loss": ("Total loss", "loss [1]", True),
+        "total": ("Total loss", "loss [1]", True),
+        "mse": ("Mean squared error", "MSE [1]", True),
+        "lpips": ("LPIPS term", "LPIPS [1]", True),
+        "nb": ("Dice of the billboard silhouette", "1 - Dice [1]", True),
+        "knn": ("Neighbour regulariser", "loss [1]", True),
+        "delta": ("Offset regulariser", "loss [1]", True),
+        "rate": ("Learning-rate factor", "factor [1]", True),
+        "rate_factor": ("Learning-rate factor", "factor [1]", True),
+        "shrink": ("Resolution divisor", "divisor [1]", False),
+        "steps_per_second": ("Training speed", "steps per second [1/s]", False),
+    }
+    order = [name for name in titles if name in names] + sorted(set(names) - set(titles))
+    charts = []
+    for name in order:
+        title, y_label, log_y = titles.get(name, (name, f"{name} [1]", False))
+        series = {
+            avatar: thin(
+                [(float(e["step"]), float(e[name])) for e in events if _is_number(e.get(name)) and "step" in e]
+            )
+            for avatar, events in histories.items()
+        }
+        chart = line_chart(title, series, x_label="step", y_label=y_label, log_y=log_y)
+        if chart:
+            charts.append(chart)
+    if not charts:
+        return "<p>No training history was given.</p>"
+    return '<div class="charts">\n' + "\n".join(f"<div>{chart}</div>" for chart in charts) + "\n</div>"
+
+
+def pictures_section(pictures: Sequence[tuple[str, str, str]]) -> str:
+    """Further pictures, full width: (title, data address, alternative text)."""
+    return "\n".join(
+        f'<figure class="wide"><img src="{address}" alt="{_safe(text)}">'
+        f"<figcaption>{html.escape(title)}</figcaption></figure>"
+        for title, address, text in pictures
+    )
+
+
+def provenance_section(results: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
+    """Where every result comes from.
+
+    Args:
+        results: (file, content with a run record under ``record`` or at the top).
+    """
+    if not results:
+        return "<p>No results were given.</p>"
+    heads = ("result", "code", "commit", "device", "protocol", "frames", "images")
+    rows, details = [], []
+    for path, content in results:
+        record = content.get("record") or content
+        git = record.get("git") or {}
+        commit = str(git.get("commit") or "")[:10] + (" (edited)" if git.get("dirty") else "")
+        values = (
+            record.get("code", ""),
+            commit,
+            record.get("device", ""),
+            content.get("protocol_hash", ""),
+            content.get("frames", ""),
+            content.get("count", ""),
+        )
+        cells = "".join(f"<td>{html.escape(str(value))}</td>" for value in values)
+        rows.append(f'<tr><th scope="row">{html.escape(path)}</th>{cells}</tr>')
+        text = json.dumps(
+            {k: record.get(k) for k in ("config", "inputs", "versions", "seed")}, indent=1, sort_keys=True
+        )
+        details.append(f"<details><summary>{html.escape(path)}</summary><pre>{html.escape(text)}</pre></details>")
+    head = "".join(f'<th scope="col">{name}</th>' for name in heads)
+    table = (
+        f'<div class="scroll" tabindex="0" role="region" aria-label="provenance"><table><thead><tr>{head}</tr></thead>'
+    )
+    return table + f"<tbody>{''.join(rows)}</tbody></table></div>" + "\n".join(details)
+
+
+def page(title: str, label: str, sections: Sequence[tuple[str, str, str]]) -> str:
+    """The whole page.
+
+    Args:
+        title: heading of the page.
+        label: a warning shown at its top, such as that sizes are not the paper's; may be empty.
+        sections: (id, heading, HTML) in order; sections without content are left out.
+    """
+    here = files("nbavatar.reporting")
+    style = here.joinpath("page.css").read_text(encoding="utf-8")
+    script = here.joinpath("page.js").read_text(encoding="utf-8")
+    kept = [section for section in sections if section[2]]
+    links = "".join(f'<a href="#{identity}">{html.escape(heading)}</a>' for identity, heading, _ in kept)
+    body = "\n".join(f'<section id="{i}">\n<h2>{html.escape(h)}</h2>\n{content}\n</section>' for i, h, content in kept)
+    warning = f'<p class="label">{html.escape(label)}: not comparable with the paper\'s figures.</p>' if label else ""
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>{html.escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
+        f"<h1>{html.escape(title)}</h1>\n{warning}\n<nav>{links}</nav>\n<main>\n{body}\n</main>\n"
+        f"<script>\n{script}</script>\n</body>\n</html>\n"
+    )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _safe(text: str) -> str:
+    return html.escape(re.sub(r"\s+", " ", text), quote=True)
