@@ -109,6 +109,10 @@ def _backend(name: str, device: torch.device) -> _Blend:
         name = device.type if device.type in ("cpu", "cuda") else "reference"
     if name == "reference":
         return blend_reference
+    if name == "cpu" and device.type == "cpu":
+        from nbavatar.raster.cpu import blend_cpu  # Numba is loaded only when it is needed
+
+        return blend_cpu
     if name != device.type:
         raise DeviceError.of(_WHERE, "backend", expected=f"tensors on {name}", found=f"tensors on {device.type}")
     return blend_reference

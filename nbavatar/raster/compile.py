@@ -1,0 +1,190 @@
+"""Numba on the CPU: compiled once a machine, kept on disk, run on torch's number of threads.
+
+The compiled code is stored under a digest of this package's sources, of Numba and of the
+processor, so a changed helper never meets a stale kernel. Where the package's own
+`__pycache__` cannot be written, or `NUMBA_CACHE_DIR` names another place, the code goes there
+or to the user's cache. Of several processes that start at once, one compiles and the others
+wait for it.
+"""
+
+import contextlib
+import hashlib
+import logging
+import os
+import platform
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+import torch
+from llvmlite import binding
+from numba import njit, types
+from numba.core import caching, cgutils
+from numba.extending import intrinsic
+
+__all__ = ["FAST", "fetch_add", "fixed", "inlined", "kernel", "prepare", "run_workers"]
+
+_LOG = logging.getLogger("nbavatar.raster")
+
+# Contraction and reassociation only: comparisons with NaN and infinity must keep their meaning.
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+
+_SOURCES = ("binning.py", "compile.py", "cpu_kernels.py", "scalar.py", "vector.py")
+
+
+@cache
+def _digest() -> str:
+    """Digest of everything that the compiled code depends on."""
+    state = hashlib.sha256()
+    for name in _SOURCES:
+        state.update((Path(__file__).parent / name).read_bytes())
+    host = (numba.__version__, platform.machine(), platform.python_version(), binding.get_host_cpu_name())
+    state.update(repr(host).encode())
+    state.update(binding.get_host_cpu_features().flatten().encode())
+    return state.hexdigest()[:20]
+
+
+@cache
+def cache_folder() -> Path:
+    """First writable place for compiled code."""
+    candidates = []
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        candidates.append(Path(os.environ["NUMBA_CACHE_DIR"]) / "nbavatar")
+    candidates.append(Path(__file__).parent / "__pycache__")
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    candidates.append(Path(home) / "nbavatar")
+    candidates.append(Path(tempfile.gettempdir()) / f"nbavatar-{os.getuid()}")
+    for folder in candidates:
+        with contextlib.suppress(OSError):
+            folder = folder / f"raster-{_digest()}"
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+    return Path(tempfile.mkdtemp(prefix="nbavatar-"))
+
+
+class _Locator(caching._CacheLocator):
+    """Tells Numba where the kernels of this package are kept and when they are stale."""
+
+    def __init__(self, py_func: Any, py_file: str) -> None:
+        self._lineno = py_func.__code__.co_firstlineno
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder())
+
+    def get_source_stamp(self) -> str:
+        return _digest()
+
+    def get_disambiguator(self) -> str:
+        return str(self._lineno)
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> "_Locator | None":
+        return cls(py_func, py_file) if Path(py_file).parent == Path(__file__).parent else None
+
+
+caching.CodeLibraryCacheImpl._locator_classes.insert(0, _Locator)
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compiles a kernel: no interpreter lock, cached on disk."""
+    return njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")(function)
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """Compiles a function that its caller absorbs."""
+    return njit(nogil=True, fastmath=FAST, error_model="numpy", forceinline=True)(function)
+
+
+@intrinsic
+def fixed(typingctx: Any, array: Any, index: Any) -> Any:
+    """Element of an array that nobody writes while the kernel runs.
+
+    LLVM cannot know that a store to one array leaves another alone, and without that knowledge
+    it vectorises none of our loops; an invariant load says it.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        view = context.make_array(signature.args[0])(context, builder, args[0])
+        value = builder.load(builder.gep(view.data, [args[1]]))
+        value.set_metadata("invariant.load", builder.module.add_metadata([]))
+        return value
+
+    return array.dtype(array, types.intp), generate
+
+
+@intrinsic
+def fetch_add(typingctx: Any, array: Any, amount: Any) -> Any:
+    """Adds to the first element of an int64 array, atomically, and returns what it was."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        view = context.make_array(signature.args[0])(context, builder, args[0])
+        return builder.atomic_rmw("add", cgutils.gep(builder, view.data, 0), args[1], "monotonic")
+
+    return types.int64(array, types.int64), generate
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    try:
+        import fcntl
+    except ImportError:  # no such locks on this system: at worst two processes compile the same
+        yield
+        return
+    with open(path, "w") as handle:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+
+
+_READY: set[str] = set()
+_READY_LOCK = threading.Lock()
+
+
+def prepare(name: str, kernels: dict[Any, tuple[Any, ...]]) -> None:
+    """Loads kernels from disk, or compiles them and stores them there.
+
+    Args:
+        name: of this set of kernels.
+        kernels: dispatcher -> argument types.
+    """
+    if name in _READY:
+        return
+    with _READY_LOCK:
+        if name in _READY:
+            return
+        stamp = cache_folder() / f"{name}.ready"
+        if stamp.exists():
+            _compile(kernels)
+        else:
+            with _locked(cache_folder() / "compile.lock"):
+                if not stamp.exists():
+                    _LOG.warning("compiling the rasterizer's %s kernels, once for this machine", name)
+                _compile(kernels)
+                stamp.touch()
+        _READY.add(name)
+
+
+def _compile(kernels: dict[Any, tuple[Any, ...]]) -> None:
+    for dispatcher, signature in kernels.items():
+        dispatcher.compile(signature)
+
+
+_POOL: tuple[int, int, ThreadPoolExecutor] | None = None  # process, threads, executor
+
+
+def run_workers(work: Callable[[int], Any]) -> list[Any]:
+    """Calls `work(worker)` for every worker, one a thread, and returns what each gave back."""
+    global _POOL
+    threads = torch.get_num_threads()
+    if threads == 1:
+        return [work(0)]
+    # A forked child inherits the executor without its threads; it needs one of its own.
+    if _POOL is None or _POOL[:2] != (os.getpid(), threads):
+        _POOL = (os.getpid(), threads, ThreadPoolExecutor(threads - 1, thread_name_prefix="nbavatar-raster"))
+    others = [_POOL[2].submit(work, worker) for worker in range(1, threads)]
+    return [work(0)] + [other.result() for other in others]

@@ -1,0 +1,453 @@
+"""Numba kernels of the CPU rasterizer: blending tile by tile, gradients billboard by billboard.
+
+Exact order without a full sort: a tile takes its billboards by the least depth that they reach.
+Hits wait in a short queue per pixel, sorted by depth; those nearer than anything that the
+billboards still to come can reach are final and are blended. A pixel that has become opaque
+takes no more hits, and a tile whose pixels all have stops. With a queue of n hits, or none, the
+same loop gives `kbuffer(n)` and `center`.
+
+The backward pass repeats that loop, notes every blended hit (`replay`), walks each pixel's hits
+from back to front, which needs no division by a transmittance, and leaves two numbers a hit.
+A second kernel (`collect`) then gathers them billboard by billboard, so every gradient has one
+writer and a fixed order of summation: results do not depend on threads or timing.
+"""
+
+import numpy as np
+
+from nbavatar.raster import scalar
+from nbavatar.raster.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
+from nbavatar.raster.compile import fetch_add, inlined, kernel
+from nbavatar.raster.vector import (
+    LANES,
+    count_trailing_zeros,
+    evaluate_row,
+    make_blend,
+    make_dot,
+    make_scatter,
+    make_slopes,
+)
+
+__all__ = ["PIXELS", "collect", "traverse"]
+
+PIXELS = TILE_WIDTH * TILE_HEIGHT
+
+
+@inlined
+def _minimum(a, b):
+    return a if a < b else b
+
+
+@inlined
+def _maximum(a, b):
+    return a if a > b else b
+
+
+@inlined
+def _select(condition, yes, no):
+    return yes if condition else no
+
+
+_S = scalar.build(inlined, np.floor, _minimum, _maximum, _select)
+first_texel, weights, slopes, mix, plane_slopes, affine = (
+    _S.first_texel, _S.weights, _S.slopes, _S.mix, _S.plane_slopes, _S.affine,
+)  # fmt: skip
+_blend8, _blend4, _blend2, _blend1 = (make_blend(n) for n in (8, 4, 2, 1))
+_dot8, _dot4, _dot2, _dot1 = (make_dot(n) for n in (8, 4, 2, 1))
+_slopes8, _slopes4, _slopes2, _slopes1 = (make_slopes(n) for n in (8, 4, 2, 1))
+_scatter8, _scatter4, _scatter2, _scatter1 = (make_scatter(n) for n in (8, 4, 2, 1))
+
+
+@inlined
+def _blend(sums, at, textures, i00, i01, i10, i11, w00, w01, w10, w11, channels):
+    c = 0
+    while c + 8 <= channels:
+        _blend8(sums, at + c, textures, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11)
+        c += 8
+    if channels & 4:
+        _blend4(sums, at + c, textures, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11)
+        c += 4
+    if channels & 2:
+        _blend2(sums, at + c, textures, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11)
+        c += 2
+    if channels & 1:
+        _blend1(sums, at + c, textures, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11)
+
+
+@inlined
+def _dot(grads, at, textures, i00, i01, i10, i11, w00, w01, w10, w11, channels, zero):
+    total = zero
+    c = 0
+    while c + 8 <= channels:
+        total += _dot8(grads, at + c, textures, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11)
+        c += 8
+    if channels & 4:
+        total += _dot4(grads, at + c, textures, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11)
+        c += 4
+    if channels & 2:
+        total += _dot2(grads, at + c, textures, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11)
+        c += 2
+    if channels & 1:
+        total += _dot1(grads, at + c, textures, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11)
+    return total
+
+
+@inlined
+def _slope(grads, at, textures, i00, i01, i10, i11, x0, x1, y0, y1, a, b, c, d, channels, zero):
+    by_s, by_t = zero, zero
+    k = 0
+    while k + 8 <= channels:
+        s, t = _slopes8(grads, at + k, textures, i00 + k, i01 + k, i10 + k, i11 + k, x0, x1, y0, y1, a, b, c, d)
+        by_s, by_t = by_s + s, by_t + t
+        k += 8
+    if channels & 4:
+        s, t = _slopes4(grads, at + k, textures, i00 + k, i01 + k, i10 + k, i11 + k, x0, x1, y0, y1, a, b, c, d)
+        by_s, by_t = by_s + s, by_t + t
+        k += 4
+    if channels & 2:
+        s, t = _slopes2(grads, at + k, textures, i00 + k, i01 + k, i10 + k, i11 + k, x0, x1, y0, y1, a, b, c, d)
+        by_s, by_t = by_s + s, by_t + t
+        k += 2
+    if channels & 1:
+        s, t = _slopes1(grads, at + k, textures, i00 + k, i01 + k, i10 + k, i11 + k, x0, x1, y0, y1, a, b, c, d)
+        by_s, by_t = by_s + s, by_t + t
+    return by_s, by_t
+
+
+@inlined
+def _scatter(totals, i00, i01, i10, i11, w00, w01, w10, w11, grads, at, channels):
+    c = 0
+    while c + 8 <= channels:
+        _scatter8(totals, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11, grads, at + c)
+        c += 8
+    if channels & 4:
+        _scatter4(totals, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11, grads, at + c)
+        c += 4
+    if channels & 2:
+        _scatter2(totals, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11, grads, at + c)
+        c += 2
+    if channels & 1:
+        _scatter1(totals, i00 + c, i01 + c, i10 + c, i11 + c, w00, w01, w10, w11, grads, at + c)
+
+
+@inlined
+def _release(pixel, slot, member, queue, through, sums, features, grads, grad_at, hits, chain, last, counts, entry,
+             limits, texels, channels, replay):  # fmt: skip
+    """Blends the hit in a queue's slot, or, in the replay, notes it."""
+    zero, one, size, step, alpha_max = limits[0], limits[1], limits[2], limits[3], limits[7]
+    s, t, a = queue[slot], queue[slot + 1], queue[slot + 3]
+    passed = through[pixel]
+    a = min(a, alpha_max)
+    column, row = first_texel(s, size, zero, one), first_texel(t, size, zero, one)
+    x0, x1 = weights(s, column, step, zero, one)
+    y0, y1 = weights(t, row, step, zero, one)
+    i00 = (np.int64(member) * texels * texels + np.int64(row) * texels + np.int64(column)) * channels
+    right, below = np.int64(step) * channels, np.int64(step) * texels * channels
+    i01, i10, i11 = i00 + right, i00 + below, i00 + right + below
+    if replay:
+        worth = grads[grad_at + channels]
+        if channels > 0:
+            worth += _dot(grads, grad_at, features, i00, i01, i10, i11, y0 * x0, y0 * x1, y1 * x0, y1 * x1, channels,
+                          zero)  # fmt: skip
+        number = counts[0]
+        counts[0] = number + 1
+        hits[3 * number], hits[3 * number + 1], hits[3 * number + 2] = worth, a, passed
+        chain[2 * number], chain[2 * number + 1] = entry, last[pixel]
+        last[pixel] = number
+    elif channels > 0:
+        w = passed * a
+        y0, y1 = y0 * w, y1 * w
+        _blend(sums, pixel * channels, features, i00, i01, i10, i11, y0 * x0, y0 * x1, y1 * x0, y1 * x1, channels)
+    through[pixel] = passed * (one - a)
+
+
+@kernel
+def traverse(turn, tiles, start, members, offset, record, box, place, features, alpha, limits, shape, image, opacity,
+             grads, notes, base, real, whole, status):  # fmt: skip
+    """Works through tiles until none is left: blends them, or notes what `collect` needs.
+
+    Args:
+        turn: (1,) int64, next position in `tiles`, shared by all workers.
+        tiles: (n,) int32, in the order in which to take them.
+        start, members, offset, record, box, place: see Bins; `record` flat.
+        features, alpha: textures, flat.
+        limits: see `evaluate_row`.
+        shape: texels, channels, width, height, tiles across, queue, capacity of a queue, rows worked on at
+            once, replay.
+        image, opacity: (C, H, W), (H, W) results; not written in the replay.
+        grads: (H, W, C + 1) flat, gradients of the results with that of alpha last; used in the replay.
+        notes: (pixels of all boxes, 2) flat, receives T a and the gradient by a of every hit.
+        base: offset of the first of `notes`.
+        real, whole: scratch of this worker.
+        status: [number of tiles given up, billboard with a NaN alpha + 1, hits, tiles given up ...].
+    """
+    texels, channels, width, height, across, depth, capacity, rows, replay = (
+        shape[0], shape[1], shape[2], shape[3], shape[4], shape[5], shape[6], shape[7], shape[8] != 0,
+    )  # fmt: skip
+    zero, one, t_min = limits[0], limits[1], limits[6]
+    band = TILE_WIDTH * rows
+    # Scratch: what a row of pixels found, transmittances, sums of colour, queues; then the replay's hits.
+    found, through = real[: 4 * LANES], real[4 * LANES : 4 * LANES + band + LANES]
+    at = 4 * LANES + band + LANES
+    sums = real[at : at + band * channels]
+    at += band * channels
+    queue = real[at : at + 4 * band * capacity]
+    hits = real[at + 4 * band * capacity :]
+    head, tail, last = whole[:band], whole[band : 2 * band], whole[2 * band : 3 * band]
+    who = whole[3 * band : 3 * band + band * capacity]
+    counts = whole[3 * band + band * capacity : 3 * band + band * capacity + 1]
+    chain = whole[3 * band + band * capacity + 1 :]
+    while True:
+        position = fetch_add(turn, 1)
+        if position >= len(tiles):
+            break
+        tile = tiles[position]
+        left, tile_top = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
+        right, tile_bottom = min(left + TILE_WIDTH, width), min(tile_top + TILE_HEIGHT, height)
+        if replay:
+            for i in range(2 * (offset[start[tile]] - base), 2 * (offset[start[tile + 1]] - base)):
+                notes[i] = zero
+        overflow = False
+        for top in range(tile_top, tile_bottom, rows):
+            bottom = min(top + rows, tile_bottom)
+            for i in range(band):
+                through[i] = zero
+                head[i], tail[i], last[i] = 0, 0, -1
+            for y in range(top, bottom):
+                for x in range(left, right):
+                    through[(y - top) * TILE_WIDTH + x - left] = one
+            for i in range(band * channels):
+                sums[i] = zero
+            counts[0] = 0
+            active = (bottom - top) * (right - left)
+            for entry in range(start[tile], start[tile + 1]):
+                i = members[entry]
+                x_first, x_end = max(left, box[i, 0]), min(right, box[i, 2])
+                y_first, y_end = max(top, box[i, 1]), min(bottom, box[i, 3])
+                if y_first >= y_end:
+                    continue
+                r = i * RECORD
+                x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
+                fade, reach = record[r + 10], record[r + 11]
+                own_place = place[i]
+                for y in range(y_first, y_end):
+                    dy = zero + np.float32(y - y_origin)
+                    for x_start in range(x_first, x_end, LANES):
+                        row_start = (y - top) * TILE_WIDTH + x_start - left
+                        mask = evaluate_row(record, r, zero + np.float32(x_start - x_origin), dy, x_end - x_start,
+                                            alpha, np.int64(i) * texels * texels, texels, limits, through, row_start,
+                                            found)  # fmt: skip
+                        if mask >> 32:
+                            status[1] = i + 1
+                            mask &= 0xFFFFFFFF
+                        while mask != 0:
+                            lane = count_trailing_zeros(mask)
+                            mask &= mask - 1
+                            pixel = row_start + lane
+                            key = found[2 * LANES + lane]
+                            a = fade * found[3 * LANES + lane]
+                            slots = pixel * capacity
+                            grad_at = ((y * width) + x_start + lane) * (channels + 1)
+                            begin, end = head[pixel], tail[pixel]
+                            if depth < 0:
+                                while begin < end and queue[4 * (slots + begin) + 2] >= reach:
+                                    _release(pixel, 4 * (slots + begin), members[who[slots + begin]], queue, through,
+                                             sums, features, grads, grad_at, hits, chain, last, counts,
+                                             who[slots + begin], limits, texels, channels, replay)  # fmt: skip
+                                    begin += 1
+                                    if through[pixel] < t_min:
+                                        begin = end
+                                        active -= 1
+                                if begin == end:
+                                    begin, end = 0, 0
+                                    if through[pixel] < t_min:
+                                        head[pixel], tail[pixel] = 0, 0
+                                        continue
+                            if end == capacity:
+                                if begin == 0:
+                                    overflow = True
+                                    break
+                                for j in range(begin, end):
+                                    for k in range(4):
+                                        queue[4 * (slots + j - begin) + k] = queue[4 * (slots + j) + k]
+                                    who[slots + j - begin] = who[slots + j]
+                                begin, end = 0, end - begin
+                            j = end
+                            if depth != 0:
+                                while j > begin:
+                                    other = queue[4 * (slots + j - 1) + 2]
+                                    if other > key or (other == key and place[members[who[slots + j - 1]]] < own_place):
+                                        break
+                                    for k in range(4):
+                                        queue[4 * (slots + j) + k] = queue[4 * (slots + j - 1) + k]
+                                    who[slots + j] = who[slots + j - 1]
+                                    j -= 1
+                            queue[4 * (slots + j)] = found[lane]
+                            queue[4 * (slots + j) + 1] = found[LANES + lane]
+                            queue[4 * (slots + j) + 2] = key
+                            queue[4 * (slots + j) + 3] = a
+                            who[slots + j] = entry
+                            end += 1
+                            if depth >= 0 and end - begin > depth:
+                                _release(pixel, 4 * (slots + begin), members[who[slots + begin]], queue, through, sums,
+                                         features, grads, grad_at, hits, chain, last, counts, who[slots + begin],
+                                         limits, texels, channels, replay)  # fmt: skip
+                                begin += 1
+                                if through[pixel] < t_min:
+                                    begin = end
+                                    active -= 1
+                                if begin == end:
+                                    begin, end = 0, 0
+                            head[pixel], tail[pixel] = begin, end
+                        if overflow:
+                            break
+                    if overflow:
+                        break
+                if overflow or active == 0:
+                    break
+            if overflow:
+                break
+            for y in range(top, bottom):
+                for x in range(left, right):
+                    pixel = (y - top) * TILE_WIDTH + x - left
+                    slots = pixel * capacity
+                    for j in range(head[pixel], tail[pixel]):
+                        if through[pixel] < t_min:
+                            break
+                        _release(pixel, 4 * (slots + j), members[who[slots + j]], queue, through, sums, features, grads,
+                                 (y * width + x) * (channels + 1), hits, chain, last, counts, who[slots + j], limits,
+                                 texels, channels, replay)  # fmt: skip
+            if replay:
+                for y in range(top, bottom):
+                    for x in range(left, right):
+                        number = last[(y - top) * TILE_WIDTH + x - left]
+                        behind = zero
+                        while number >= 0:
+                            worth, a, passed = hits[3 * number], hits[3 * number + 1], hits[3 * number + 2]
+                            entry = chain[2 * number]
+                            i = members[entry]
+                            x_first, x_end = max(left, box[i, 0]), min(right, box[i, 2])
+                            y_first = max(tile_top, box[i, 1])
+                            spot = 2 * (offset[entry] - base + (y - y_first) * (x_end - x_first) + x - x_first)
+                            notes[spot] = passed * a
+                            notes[spot + 1] = passed * (worth - behind)
+                            behind = a * worth + (one - a) * behind
+                            number = chain[2 * number + 1]
+                status[2] += counts[0]
+            else:
+                for c in range(channels):
+                    for y in range(top, bottom):
+                        for x in range(left, right):
+                            pixel = (y - top) * TILE_WIDTH + x - left
+                            image[c, y, x] = sums[pixel * channels + c]
+                for y in range(top, bottom):
+                    for x in range(left, right):
+                        opacity[y, x] = one - through[(y - top) * TILE_WIDTH + x - left]
+        if overflow:
+            status[3 + status[0]] = tile
+            status[0] += 1
+
+
+@kernel
+def collect(turn, chunk, first_tile, end_tile, sequence, first, tile, where, start, offset, record, box, features,
+            alpha, limits, shape, grads, notes, base, fresh,
+            grad_features, grad_alpha, grad_plane, grad_fade):  # fmt: skip
+    """Gathers the noted hits of tiles `first_tile ... end_tile` into the gradients, billboard by billboard.
+
+    Args:
+        turn: (1,) int64, next of the billboards, shared by all workers; `chunk` are taken at a time.
+        fresh: whether the gradients are still uninitialised memory.
+        grad_features, grad_alpha: like the textures, flat.
+        grad_plane: (F, 3, 3) float64; `grad_fade`: (F,) float64.
+        Others: as in `traverse` and Bins.
+    """
+    texels, channels, width, across = shape[0], shape[1], shape[2], shape[4]
+    zero, one, size, step, alpha_max = limits[0], limits[1], limits[2], limits[3], limits[7]
+    area = texels * texels
+    scale = 0.5 * (texels - 1) if texels > 1 else 1.0
+    shift = 0.5 * (texels - 1)
+    while True:
+        begin = fetch_add(turn, chunk)
+        if begin >= len(sequence):
+            break
+        for k in range(begin, min(begin + chunk, len(sequence))):
+            i = sequence[k]
+            r = i * RECORD
+            if fresh:
+                for j in range(np.int64(i) * area * channels, (np.int64(i) + 1) * area * channels):
+                    grad_features[j] = zero
+                for j in range(np.int64(i) * area, (np.int64(i) + 1) * area):
+                    grad_alpha[j] = zero
+            fade = record[r + 10]
+            x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
+            g_fade = 0.0
+            s_x, s_y, s_1, t_x, t_y, t_1, w_x, w_y, w_1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for entry in range(first[k], first[k + 1]):
+                if tile[entry] < first_tile or tile[entry] >= end_tile:
+                    continue
+                left, top = tile[entry] % across * TILE_WIDTH, tile[entry] // across * TILE_HEIGHT
+                x_first, x_end = max(left, box[i, 0]), min(left + TILE_WIDTH, box[i, 2])
+                y_first, y_end = max(top, box[i, 1]), min(top + TILE_HEIGHT, box[i, 3])
+                spot = 2 * (offset[where[entry]] - base)
+                for y in range(y_first, y_end):
+                    dy = zero + np.float32(y - y_origin)
+                    for x in range(x_first, x_end):
+                        w, by_a = notes[spot], notes[spot + 1]
+                        spot += 2
+                        if w == zero and by_a == zero:
+                            continue
+                        dx = zero + np.float32(x - x_origin)
+                        p = one / affine(record[r + 6], record[r + 7], record[r + 8], dx, dy)
+                        s = affine(record[r], record[r + 1], record[r + 2], dx, dy) * p
+                        t = affine(record[r + 3], record[r + 4], record[r + 5], dx, dy) * p
+                        column, row = first_texel(s, size, zero, one), first_texel(t, size, zero, one)
+                        x0, x1 = weights(s, column, step, zero, one)
+                        y0, y1 = weights(t, row, step, zero, one)
+                        a0, a1 = slopes(s, column, step, zero, one)
+                        b0, b1 = slopes(t, row, step, zero, one)
+                        i00 = np.int64(i) * area + np.int64(row) * texels + np.int64(column)
+                        right, below = np.int64(step), np.int64(step) * texels
+                        i01, i10, i11 = i00 + right, i00 + below, i00 + right + below
+                        t00, t01, t10, t11 = alpha[i00], alpha[i01], alpha[i10], alpha[i11]
+                        sample = mix(t00, t01, t10, t11, x0, x1, y0, y1)
+                        by_s, by_t = zero, zero
+                        if fade * sample <= alpha_max:  # a capped alpha does not move
+                            g_fade += by_a * sample
+                            by_a = by_a * fade
+                            by_s = by_a * mix(t00, t01, t10, t11, a0, a1, y0, y1)
+                            by_t = by_a * mix(t00, t01, t10, t11, x0, x1, b0, b1)
+                            grad_alpha[i00] += by_a * y0 * x0
+                            grad_alpha[i01] += by_a * y0 * x1
+                            grad_alpha[i10] += by_a * y1 * x0
+                            grad_alpha[i11] += by_a * y1 * x1
+                        if channels > 0:
+                            at = (np.int64(y) * width + x) * (channels + 1)
+                            i00, i01, i10, i11 = i00 * channels, i01 * channels, i10 * channels, i11 * channels
+                            ds, dt = _slope(grads, at, features, i00, i01, i10, i11, x0, x1, y0, y1, a0, a1, b0, b1,
+                                            channels, zero)  # fmt: skip
+                            by_s, by_t = by_s + w * ds, by_t + w * dt
+                            y0, y1 = y0 * w, y1 * w
+                            _scatter(grad_features, i00, i01, i10, i11, y0 * x0, y0 * x1, y1 * x0, y1 * x1, grads, at,
+                                     channels)  # fmt: skip
+                        gs, gt, gw = plane_slopes(by_s, by_t, s, t, p)
+                        s_x, s_y, s_1 = s_x + gs * dx, s_y + gs * dy, s_1 + gs
+                        t_x, t_y, t_1 = t_x + gt * dx, t_y + gt * dy, t_1 + gt
+                        w_x, w_y, w_1 = w_x + gw * dx, w_y + gw * dy, w_1 + gw
+            # from texel coordinates about the record's origin to texture coordinates about the image's
+            ox, oy = x_origin + 0.5, y_origin + 0.5
+            s_x, s_y = s_x + s_1 * ox, s_y + s_1 * oy
+            t_x, t_y = t_x + t_1 * ox, t_y + t_1 * oy
+            w_x, w_y = w_x + w_1 * ox, w_y + w_1 * oy
+            if fresh:
+                for j in range(9):
+                    grad_plane[i, j // 3, j % 3] = 0.0
+                grad_fade[i] = 0.0
+            grad_plane[i, 0, 0] += scale * s_x
+            grad_plane[i, 0, 1] += scale * s_y
+            grad_plane[i, 0, 2] += scale * s_1
+            grad_plane[i, 1, 0] += scale * t_x
+            grad_plane[i, 1, 1] += scale * t_y
+            grad_plane[i, 1, 2] += scale * t_1
+            grad_plane[i, 2, 0] += w_x + shift * (s_x + t_x)
+            grad_plane[i, 2, 1] += w_y + shift * (s_y + t_y)
+            grad_plane[i, 2, 2] += w_1 + shift * (s_1 + t_1)
+            grad_fade[i] += g_fade
