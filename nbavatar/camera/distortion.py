@@ -85,7 +85,7 @@ def undistort_pixels(
     if distortion is None:
         return np.asarray(pixels, dtype=np.float64)
     target = _to_plane(pixels, K)
-    guess = target.copy()
+    guess, det = target.copy(), np.ones(target.shape[:-1])
     step = 1e-6
     for _ in range(iterations):
         error = distort_plane(guess, distortion) - target
@@ -98,8 +98,11 @@ def undistort_pixels(
         guess = guess - np.stack([delta_x, delta_y], axis=-1)
         if np.nanmax(np.abs(error), initial=0.0) < 1e-13:
             break
-    error = np.abs(distort_plane(guess, distortion) - target).max(axis=-1, keepdims=True)
-    return _from_plane(np.where(error < 1e-8, guess, np.nan), K)
+    missed = np.abs(distort_plane(guess, distortion) - target).max(axis=-1)
+    # The equation has further roots beyond the radius where the lens folds over: there the orientation flips
+    # (negative determinant) or the point lies on the other side of the axis.
+    good = (missed < 1e-8) & (det > 0) & ((guess * target).sum(axis=-1) >= 0)
+    return _from_plane(np.where(good[..., None], guess, np.nan), K)
 
 
 def undistortion_map(

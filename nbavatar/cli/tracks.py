@@ -3,7 +3,8 @@
 Reads, by --layout,
 
   decaf     ROOT/{train,test}/params/S/params_smoothed.pkl, head_keys, right_hand_keys, head_bbs, right_hand_bbs,
-            contacts, deformations, cameras, cutIDs and ROOT/assets with FLAME (generic_model.pkl) and MANO (MANO_RIGHT.pkl)
+            contacts, deformations, cameras, cutIDs and ROOT/assets with FLAME (generic_model.pkl) and MANO
+            (mano_v1_2/models/MANO_RIGHT.pkl)
   capture   ROOT/cameras.json, meshes/topology.npz, meshes/FRAME.npz, splits.json
 
 and writes a mesh sequence (.npz, see `nbavatar.data.sequences`):
