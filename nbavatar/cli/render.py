@@ -51,10 +51,10 @@ def main(args: argparse.Namespace) -> int:
 def _render(args: argparse.Namespace, protocol: ProtocolConfig, device: str) -> int:
     from nbavatar.avatar.model import load_avatar
     from nbavatar.data.sequences import read_sequence
+    from nbavatar.data.views import views_of
     from nbavatar.evaluation.protocols import select_frames
     from nbavatar.evaluation.render import render_views
     from nbavatar.io.framepack import FramePack, FramePackWriter
-    from nbavatar.training.data import views_of
 
     avatar = load_avatar(args.model, device)
     sequence, _ = read_sequence(args.meshes)

@@ -40,10 +40,10 @@ def main(args: argparse.Namespace) -> int:
         from nbavatar.avatar.model import load_avatar
         from nbavatar.avatar.unet import macs
         from nbavatar.data.sequences import read_sequence
+        from nbavatar.data.views import views_of
         from nbavatar.evaluation.protocols import select_frames
         from nbavatar.evaluation.speed import measure_speed
         from nbavatar.io.framepack import FramePack
-        from nbavatar.training.data import views_of
 
         avatar = load_avatar(args.model, device)
         sequence, _ = read_sequence(args.meshes)

@@ -80,8 +80,8 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
 
     from nbavatar.avatar.model import save_avatar
     from nbavatar.data.sequences import read_sequence
+    from nbavatar.data.views import ViewStore, views_of
     from nbavatar.io.framepack import FramePack
-    from nbavatar.training.data import ViewStore, views_of
     from nbavatar.training.loop import train
     from nbavatar.training.setup import initial_avatar, modelled_parts, neighbour_graph
     from nbavatar.training.state import RunFolder

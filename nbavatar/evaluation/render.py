@@ -10,8 +10,8 @@ from torch import Tensor
 from nbavatar.avatar.model import Avatar
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.data.sequences import MeshSequence
+from nbavatar.data.views import View
 from nbavatar.errors import DataError
-from nbavatar.training.data import View
 
 __all__ = ["Picture", "check_parts", "render_views"]
 

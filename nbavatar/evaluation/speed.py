@@ -24,9 +24,9 @@ from nbavatar.avatar.model import Avatar, compose
 from nbavatar.avatar.region import Region, shift_camera
 from nbavatar.config.avatar import SpeedConfig
 from nbavatar.data.sequences import MeshSequence
+from nbavatar.data.views import View
 from nbavatar.evaluation.render import check_parts
 from nbavatar.raster.functional import render_billboards
-from nbavatar.training.data import View
 
 __all__ = ["measure_speed", "peak_memory_mb"]
 

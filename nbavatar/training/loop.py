@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from nbavatar.avatar.model import Avatar
 from nbavatar.config.avatar import TrainConfig
+from nbavatar.data.views import ViewStore, ViewStream
 from nbavatar.errors import NBAvatarError
-from nbavatar.training.data import ViewStore, ViewStream
 from nbavatar.training.objective import step_loss
 from nbavatar.training.preview import contact_sheet
 from nbavatar.training.schedule import Plan, plan_at, total_steps

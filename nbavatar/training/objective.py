@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from nbavatar.avatar.losses import loss_delta, loss_dice, loss_dice_haha, loss_knn, loss_mse
 from nbavatar.avatar.model import Avatar, Window, compose
 from nbavatar.config.avatar import TrainConfig
-from nbavatar.training.data import Sample
+from nbavatar.data.views import Sample
 from nbavatar.training.schedule import Plan
 
 __all__ = ["Target", "step_loss", "target_in"]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nbavatar.avatar.model import Avatar, compose
 from nbavatar.avatar.region import paste
-from nbavatar.training.data import Sample
+from nbavatar.data.views import Sample
 
 __all__ = ["contact_sheet"]
 

@@ -13,8 +13,8 @@ from nbavatar.avatar.refine import Refinement, displacement_basis
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.errors import ConfigError, DataError
-from nbavatar.mesh.frames import FaceFrames, face_frames
-from nbavatar.mesh.texels import texel_values
+from nbavatar.mesh.frames import face_frames
+from nbavatar.mesh.spectral import texel_values
 
 __all__ = ["initial_avatar", "modelled_parts", "neighbour_graph"]
 
@@ -58,10 +58,9 @@ def initial_avatar(
     for part in parts:
         mesh = sequence.parts[part]
         rest, faces = torch.from_numpy(np.asarray(mesh.rest)).float(), torch.from_numpy(np.asarray(mesh.faces))
-        local = face_frames(rest, faces)
-        size = initial_half_extents(rest, faces, local, margin=config.extent_margin)
+        size = initial_half_extents(rest, faces, face_frames(rest, faces), margin=config.extent_margin)
         extents.append(size)
-        features.append(_initial_features(rest, faces, local, size, coords.get(part), config))
+        features.append(_initial_features(rest, faces, size, coords.get(part), config))
     count = sum(len(size) for size in extents)
     logits = gaussian_alpha_logits(
         config.texels,
@@ -108,7 +107,7 @@ def _channels(config: TrainConfig) -> int:
 
 
 def _initial_features(
-    rest: Tensor, faces: Tensor, local: FaceFrames, size: Tensor, coords: np.ndarray | None, config: TrainConfig
+    rest: Tensor, faces: Tensor, size: Tensor, coords: np.ndarray | None, config: TrainConfig
 ) -> Tensor:
     """Neural textures float32 (F, T, T, C) before training."""
     shape = (len(faces), config.texels, config.texels, _channels(config))
@@ -122,7 +121,8 @@ def _initial_features(
     if config.texels == 1:
         features[..., : used.shape[1]] = used[faces].mean(1)[:, None, None]
     else:
-        features[..., : used.shape[1]] = texel_values(used, faces, rest, local, size, config.texels)
+        known = texel_values(used.numpy(), rest.numpy(), faces.numpy(), size.numpy(), config.texels)
+        features[..., : used.shape[1]] = torch.from_numpy(known)
     return features
 
 

@@ -1,0 +1,1 @@
+"""Small scenes that tests of several areas share."""

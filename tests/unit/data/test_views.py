@@ -1,0 +1,109 @@
+"""Streaming of training views: exact pixels, bounded memory, an order that nothing but the seed moves."""
+
+import numpy as np
+import pytest
+import torch
+
+from nbavatar.data.views import ViewStore, ViewStream, shuffled, views_of
+from nbavatar.errors import DataError
+from nbavatar.io.framepack import FramePack
+from tests.scenes.toy import FRAMES, SIZE, write_scene
+
+PARTS = ["head", "right_hand"]
+
+
+@pytest.fixture(scope="module")
+def packs(tmp_path_factory: pytest.TempPathFactory) -> list[FramePack]:
+    return [FramePack(path) for path in write_scene(tmp_path_factory.mktemp("scene"))["packs"]]
+
+
+def _views(packs):
+    return views_of(packs, FRAMES, [pack.split("train") for pack in packs], layers=("rgb", "alpha"))
+
+
+def _picture(sample) -> np.ndarray:
+    full = np.zeros((5, sample.height, sample.width), np.float32)
+    height, width = sample.pixels.shape[-2:]
+    full[:, sample.y0 : sample.y0 + height, sample.x0 : sample.x0 + width] = sample.pixels.numpy()
+    return full
+
+
+def test_views_of_lists_training_frames_of_all_cameras(packs) -> None:
+    views = _views(packs)
+    assert [(v.camera, v.frame) for v in views] == [(f"cam{c}", f) for c in range(3) for f in FRAMES[:3]]
+    assert all(v.row == FRAMES.index(v.frame) for v in views)
+
+
+def test_sample_is_the_premultiplied_picture(packs) -> None:
+    views = _views(packs)
+    picture = _picture(ViewStore(packs, views, PARTS, 10**9).sample(4))
+    rgb, alpha = packs[1].read("rgb", "f1") / 255.0, packs[1].read("alpha", "f1") / 255.0
+    np.testing.assert_allclose(picture[:3], (rgb * alpha[..., None]).transpose(2, 0, 1), atol=1e-6)
+    np.testing.assert_allclose(picture[3], alpha, atol=1e-6)
+    assert picture[4].max() == 0
+
+
+@pytest.mark.parametrize("shrink", [2, 4])
+def test_sample_shrinks_by_block_means_with_scaled_intrinsics(packs, shrink: int) -> None:
+    views = _views(packs)
+    store = ViewStore(packs, views, PARTS, 10**9)
+    full, small = _picture(store.sample(0)), store.sample(0, shrink)
+    blocks = full.reshape(5, SIZE // shrink, shrink, SIZE // shrink, shrink).mean((2, 4))
+    np.testing.assert_allclose(_picture(small), blocks, atol=1e-6)
+    torch.testing.assert_close(small.K[:2], views[0].K[:2] / shrink)
+    assert small.K[2].tolist() == [0, 0, 1]
+
+
+def test_sample_marks_parts_that_are_not_modelled(packs) -> None:
+    picture = _picture(ViewStore(packs, _views(packs), ["head"], 10**9).sample(0))
+    hand = packs[0].read("label", "f0") == 2
+    assert (picture[4] == hand).all() and (picture[3][hand] == 0).all()
+
+
+def test_cache_is_bounded_and_changes_nothing(packs) -> None:
+    views = _views(packs)
+    large, small, none = (ViewStore(packs, views, PARTS, size) for size in (10**9, 4000, 0))
+    for turn in range(2):
+        for index in range(len(views)):
+            expected = large.sample(index)
+            for store in (small, none):
+                torch.testing.assert_close(store.sample(index).pixels, expected.pixels, atol=0, rtol=0)
+                assert store.cached_bytes <= (4000 if store is small else 0)
+    assert large.decoded == len(views)  # every frame once
+    assert none.decoded == 2 * len(views)
+
+
+@pytest.mark.parametrize("ahead", [0, 3])
+def test_stream_follows_the_seeded_order(packs, ahead: int) -> None:
+    views = _views(packs)
+    stream = ViewStream(ViewStore(packs, views, PARTS, 10**9), len(views), seed=5, ahead=ahead)
+    try:
+        for step in range(12):
+            shrink = 2 if step < 4 else 1
+            sample = stream.get(step, shrink)
+            assert sample.view == views[shuffled(step, len(views), 5)]
+            assert sample.width == SIZE // shrink
+    finally:
+        stream.close()
+
+
+def test_shuffled_visits_every_view_once_an_epoch() -> None:
+    for epoch in range(3):
+        assert sorted(shuffled(7 * epoch + i, 7, 1) for i in range(7)) == list(range(7))
+    assert [shuffled(i, 50, 1) for i in range(50)] != [shuffled(50 + i, 50, 1) for i in range(50)]
+
+
+def test_views_of_names_the_frame_without_a_mesh(packs) -> None:
+    with pytest.raises(DataError, match=r"cam0.zip: frame f2: expected a mesh of that frame"):
+        views_of(packs, FRAMES[:2], [pack.split("train") for pack in packs])
+
+
+def test_views_of_refuses_an_empty_split(packs) -> None:
+    with pytest.raises(DataError, match="at least one frame of the split"):
+        views_of(packs, FRAMES, [[], [], []])
+
+
+def test_store_refuses_pictures_of_another_size(packs) -> None:
+    views = [view._replace(width=31) for view in _views(packs)]
+    with pytest.raises(DataError, match=r"rgb/f0: expected 31x32, found 32x32"):
+        ViewStore(packs, views, PARTS, 0).sample(0)

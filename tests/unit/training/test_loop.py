@@ -1,0 +1,278 @@
+"""The trainer: it learns, resumes exactly, survives bad steps and stops with one line."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nbavatar.cli import main
+from nbavatar.config.avatar import TrainConfig, UNetConfig
+from nbavatar.config.core import to_mapping
+from nbavatar.data.sequences import MeshSequence, Part, read_sequence
+from nbavatar.data.views import ViewStore, views_of
+from nbavatar.errors import NBAvatarError
+from nbavatar.io.framepack import FramePack
+from nbavatar.training.loop import parameter_groups, train
+from nbavatar.training.setup import initial_avatar, neighbour_graph
+from nbavatar.training.state import RunFolder
+from tests.scenes.toy import sequence, write_scene
+
+CONFIG = TrainConfig(
+    steps=12, texels=4, unet=UNetConfig(width=4, depth=3, max_width=8, convs=1), weight_lpips=0.0, previews=0,
+    checkpoint_seconds=0.0, coarse_side=16, prefetch=2,
+)  # fmt: skip
+
+
+def run(scene: dict, config: TrainConfig, folder: Path, **options):
+    """Train in this process; returns avatar and summary."""
+    torch.set_num_threads(1)
+    meshes, _ = read_sequence(scene["meshes"])
+    coords = {k[: -len(".coords")]: v for k, v in np.load(scene["spectral"]).items() if k.endswith(".coords")}
+    packs = [FramePack(path) for path in scene["packs"]]
+    views = views_of(packs, meshes.frames, [pack.split("train") for pack in packs], layers=("rgb", "alpha"))
+    avatar = initial_avatar(meshes, coords, meshes.frames, config)
+    store = RunFolder(folder, {"config": to_mapping(config)})
+    verts = {part: torch.from_numpy(mesh.verts) for part, mesh in meshes.parts.items() if part in avatar.parts}
+    summary = train(
+        avatar, ViewStore(packs, views, avatar.parts, 10**8), len(views), verts,
+        neighbour_graph(avatar, meshes, config), options.pop("lpips", None), config, store, **options,
+    )  # fmt: skip
+    return avatar, summary
+
+
+def same(a, b) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
+
+
+def test_train_is_deterministic_and_depends_on_the_seed(scene, tmp_path) -> None:
+    first, _ = run(scene, CONFIG, tmp_path / "a")
+    again, _ = run(scene, replace(CONFIG, cache_mb=0, prefetch=0), tmp_path / "b")
+    other, _ = run(scene, replace(CONFIG, seed=1), tmp_path / "c")
+    assert same(first, again)
+    assert not same(first, other)
+
+
+@pytest.mark.parametrize("at", [1, 5, 11])
+def test_train_resumed_equals_unbroken_bit_for_bit(scene, tmp_path, at: int) -> None:
+    whole, _ = run(scene, CONFIG, tmp_path / "whole")
+    calls = iter(range(100))
+    _, cut = run(scene, CONFIG, tmp_path / "cut", should_stop=lambda: next(calls) == at)
+    assert not cut["finished"] and cut["steps"] == at
+    resumed, summary = run(scene, CONFIG, tmp_path / "cut")
+    assert summary["finished"] and same(whole, resumed)
+    events = [RunFolder(tmp_path / name, {"config": to_mapping(CONFIG)}).events() for name in ("whole", "cut")]
+    steps = [[event["step"] for event in found] for found in events]
+    assert steps[0] == steps[1] == sorted(set(steps[0]))
+
+
+def test_train_learns_the_toy_scene(scene, tmp_path) -> None:
+    config = replace(CONFIG, steps=120, checkpoint_seconds=60.0, rate_factor=4.0)
+    _, summary = run(scene, config, tmp_path)
+    events = RunFolder(tmp_path, {"config": to_mapping(config)}).events()
+    # Full-resolution losses only: coarse pictures are another measure.
+    assert summary["last"]["mse"] < 0.25 * events[0]["mse"]
+    assert summary["skipped"] == 0
+
+
+def test_parameter_groups_have_the_rates_of_the_supplement(scene) -> None:
+    meshes, _ = read_sequence(scene["meshes"])
+    for deferred in (True, False):
+        config = replace(CONFIG, init="random", deferred=deferred)
+        avatar = initial_avatar(meshes, {}, [], config)
+        rates = {group["name"]: group["lr"] for group in parameter_groups(avatar, config)}
+        expected = {"position": 1.6e-4, "rotation": 1e-3, "scale": 5e-3, "alpha": 5e-4}
+        expected |= {"features": 5e-4, "renderer": 1e-3} if deferred else {"features": 2.5e-3}
+        assert rates == expected
+        grouped = sum(p.numel() for group in parameter_groups(avatar, config) for p in group["params"])
+        assert grouped == sum(p.numel() for p in avatar.parameters())
+
+
+def test_bad_steps_are_skipped_counted_and_end_the_training_with_one_line(scene, tmp_path) -> None:
+    calls = iter(range(10**6))
+
+    def broken(x, y):
+        return (x - y).mean().reshape(1) * (float("nan") if next(calls) in (2, 3, 6) else 1.0)
+
+    config = replace(CONFIG, weight_lpips=0.1)
+    avatar, summary = run(scene, config, tmp_path / "a", lpips=broken)
+    assert summary["skipped"] == 3 and summary["finished"]
+    assert all(torch.isfinite(p).all() for p in avatar.parameters())
+
+    def nowhere(x, y):
+        return (x - y).mean().reshape(1) * float("nan")
+
+    with pytest.raises(NBAvatarError, match=r"4 steps in a row up to step 3 had a loss .* not finite .*rate_factor"):
+        run(scene, replace(config, max_bad_steps=4), tmp_path / "b", lpips=nowhere)
+
+
+def test_a_hundred_times_the_rate_recovers_or_stops_with_a_line(scene, tmp_path) -> None:
+    try:
+        avatar, _ = run(scene, replace(CONFIG, steps=40, rate_factor=100.0), tmp_path)
+        assert all(torch.isfinite(p).all() for p in avatar.parameters())
+    except NBAvatarError as error:
+        assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"texels": 1},
+        {"channels": 1},
+        {"channels": 24},
+        {"deferred": False},
+        {"init": "random"},
+        {"weight_nb": 0.0},
+        {"weight_knn": 0.0, "weight_delta": 0.0},
+        {"parts": ["head"]},
+        {"parts": ["right_hand"]},
+        {"dice": "haha"},
+        {"roi": False},
+        {"schedule": "paper", "steps": 8},
+        {"precision": "bf16"},
+        {"clip": 1.0},
+        {"order": "center"},
+    ],
+    ids=str,
+)
+def test_every_variant_trains(scene, tmp_path, change: dict) -> None:
+    avatar, summary = run(scene, replace(CONFIG, **({"steps": 8} | change)), tmp_path)
+    assert summary["finished"] and summary["skipped"] == 0
+    assert all(torch.isfinite(p).all() for p in avatar.parameters())
+
+
+def test_refinement_moves_meshes_of_training_frames(scene, tmp_path) -> None:
+    config = replace(CONFIG, refine=replace(CONFIG.refine, modes=3, rate=1e-3))
+    avatar, _ = run(scene, config, tmp_path)
+    assert avatar.refinement is not None
+    assert avatar.refinement.get_parameter("bend_head").abs().max() > 0
+
+
+def test_empty_masks_train_to_nothing(tmp_path) -> None:
+    scene = write_scene(tmp_path / "scene", empty=True)
+    _, summary = run(scene, replace(CONFIG, steps=60, rate_factor=5.0), tmp_path / "state")
+    assert summary["skipped"] == 0
+    assert summary["last"]["psnr"] > 15
+
+
+def test_one_frame_and_a_frame_without_hand(tmp_path) -> None:
+    whole = sequence()
+    hand = whole.parts["right_hand"]
+    verts = hand.verts.copy()
+    verts[1] = np.nan
+    parts = {**whole.parts, "right_hand": Part(hand.faces, hand.rest, verts)}
+    lost = write_scene(tmp_path / "lost", meshes=MeshSequence(whole.frames, parts, {}))
+    assert run(lost, CONFIG, tmp_path / "a")[1]["skipped"] == 0
+    single = write_scene(tmp_path / "single", meshes=whole.subset(["f0"]))
+    single["packs"] = single["packs"][:1]
+    assert run(single, CONFIG, tmp_path / "b")[1]["skipped"] == 0
+
+
+def test_time_budget_ends_the_training(scene, tmp_path) -> None:
+    began = time.monotonic()
+    _, summary = run(scene, replace(CONFIG, max_minutes=0.02), tmp_path)
+    assert summary["finished"] and 1.0 <= time.monotonic() - began < 10.0
+    assert summary["steps"] > 3
+
+
+def test_previews_are_drawn_early_middle_and_late(scene, tmp_path) -> None:
+    run(scene, replace(CONFIG, previews=3), tmp_path)
+    names = sorted(path.name for path in (tmp_path / "previews").glob("*.png"))
+    assert names == ["step_0000001.png", "step_0000006.png", "step_0000012.png"]
+
+
+def test_state_of_another_experiment_is_moved_aside(tmp_path) -> None:
+    RunFolder(tmp_path / "s", {"a": 1}).save({"step": 3})
+    assert RunFolder(tmp_path / "s", {"a": 1}).load() == {"step": 3}
+    other = RunFolder(tmp_path / "s", {"a": 2})
+    assert other.load() is None and other.moved_to is not None
+    assert (other.moved_to / "state.pt").exists()
+
+
+def test_events_after_the_checkpoint_and_torn_lines_are_dropped(tmp_path) -> None:
+    folder = RunFolder(tmp_path / "s", {})
+    for step in (1, 2, 3):
+        folder.log({"step": step})
+    folder.save({"step": 2})
+    with open(tmp_path / "s" / "events.jsonl", "a") as stream:
+        stream.write('{"step": 4, "mse"')
+    again = RunFolder(tmp_path / "s", {})
+    again.load()
+    assert [event["step"] for event in again.events()] == [1, 2]
+    lines = (tmp_path / "s" / "events.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == [1, 2]
+
+
+def _command(scene: dict, out: Path, config: TrainConfig) -> list[str]:
+    frames = [str(path) for path in scene["packs"]]
+    rest = ["--meshes", scene["meshes"], "--spectral", scene["spectral"], "--out", out, "--device", "cpu"]
+    return ["train", "--frames", *frames, *map(str, rest), "--cfg", json.dumps(to_mapping(config))]
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment_the_same_command_gives_the_same_weights(scene, tmp_path) -> None:
+    config = replace(CONFIG, steps=30)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    program = [sys.executable, "-m", "nbavatar"]
+    broken, whole = tmp_path / "broken.pt", tmp_path / "whole.pt"
+    events = Path(f"{broken}.state") / "events.jsonl"
+    command = program + _command(scene, broken, config)
+    # Killed as soon as it trains, and again a little later.
+    for lines in (1, 2):
+        process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        while process.poll() is None and not (events.exists() and events.read_text().count("\n") >= lines):
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    subprocess.run(program + _command(scene, whole, config), env=environment, check=True, capture_output=True)
+    a, b = (torch.load(path, weights_only=True)["state"] for path in (broken, whole))
+    assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.slow
+def test_terminated_it_saves_and_says_how_to_go_on(scene, tmp_path) -> None:
+    config = replace(CONFIG, steps=100_000, checkpoint_seconds=1000.0)
+    command = [sys.executable, "-m", "nbavatar", *_command(scene, tmp_path / "m.pt", config)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    events = tmp_path / "m.pt.state" / "events.jsonl"
+    while not (events.exists() and events.read_text()):
+        time.sleep(0.02)
+        assert process.poll() is None
+    process.send_signal(signal.SIGTERM)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 143 and "the same command goes on" in error
+    assert (tmp_path / "m.pt.state" / "state.pt").exists() and not (tmp_path / "m.pt").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"--meshes": "absent.npz"}, "absent.npz: expected a file (--meshes), found no such file"),
+        ({"--cfg": '{"stepz": 3}'}, "unknown key 'stepz'; did you mean 'steps'?"),
+        ({"--cfg": '{"parts": ["left_hand"]}'}, "expected parts of the meshes (head, right_hand), found left_hand"),
+        ({"--cfg": '{"channels": 0}'}, "channels: expected at least 1"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2(scene, tmp_path, capsys, change: dict, line: str) -> None:
+    command = _command(scene, tmp_path / "m.pt", CONFIG)
+    for option, value in change.items():
+        command[command.index(option) + 1] = value
+    assert main(command) == 2
+    error = capsys.readouterr().err.strip()
+    assert line in error and "\n" not in error
+    assert not (tmp_path / "m.pt").exists()
+
+
+def test_missing_coordinates_are_named(scene, tmp_path, capsys) -> None:
+    command = _command(scene, tmp_path / "m.pt", CONFIG)
+    del command[command.index("--spectral") : command.index("--spectral") + 2]
+    assert main(command) == 2
+    assert "spectral coordinates: head.coords: expected this array, found none" in capsys.readouterr().err

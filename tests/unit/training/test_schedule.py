@@ -1,0 +1,35 @@
+"""Schedules as functions of progress."""
+
+import pytest
+
+from nbavatar.config.avatar import TrainConfig
+from nbavatar.training.schedule import plan_at, total_steps
+
+
+def test_paper_schedule_is_the_supplements() -> None:
+    config = TrainConfig(schedule="paper")
+    assert total_steps(config) == 400_000
+    assert plan_at(0.0, config, 1024) == (1, 1.0, 1.0, None)
+    assert plan_at(39_999 / 400_000, config, 1024).crop is None
+    assert plan_at(40_000 / 400_000, config, 1024).crop == 256
+    end = plan_at(1.0, config, 1024)
+    assert end.rate == 1.0 and end.shrink == 1
+    assert end.position_rate == pytest.approx(0.01)
+    # gamma = 0.01^(1/N) a step, N steps
+    assert plan_at(0.5, config, 1024).position_rate == pytest.approx(0.1)
+
+
+def test_fast_schedule_goes_from_coarse_to_fine_and_ends_slow() -> None:
+    config = TrainConfig(coarse_until=[0.1, 0.35], coarse_side=64, final_rate=0.05, decay_from=0.4)
+    shrinks = [plan_at(p, config, 256).shrink for p in (0.0, 0.09, 0.1, 0.34, 0.35, 1.0)]
+    assert shrinks == [4, 4, 2, 2, 1, 1]
+    assert [plan_at(p, config, 128).shrink for p in (0.0, 0.2, 0.5)] == [2, 2, 1]
+    assert plan_at(0.0, config, 100).shrink == 1
+    rates = [plan_at(p, config, 256).rate for p in (0.0, 0.4, 0.7, 1.0)]
+    assert rates[0] == rates[1] == 1.0 and rates[2] == pytest.approx(0.525) and rates[3] == pytest.approx(0.05)
+
+
+def test_crops_wait_for_full_resolution() -> None:
+    config = TrainConfig(coarse_until=[0.5], lpips_full_until=0.1, coarse_side=64)
+    assert plan_at(0.3, config, 256).crop is None
+    assert plan_at(0.6, config, 256).crop == 256
