@@ -75,9 +75,11 @@ def _strip(name: str, group: Sequence[Rendered], crops: Sequence[FramePack], max
     cards = []
     crop = find_truth(group[0].pack, name, crops)
     if crop is not None:
-        truth = _composite(crop.read("rgb", frame), crop.read("alpha", frame), group[0].background)
+        alpha = crop.read("alpha", frame)
+        truth = _composite(crop.read("rgb", frame), alpha, group[0].background)
         picture = np.round(truth * 255).astype(np.uint8)
-        cards.append(_card("Ground truth", [(picture, f"Ground truth, {where}")], "", max_side))
+        pictures = [(picture, f"Ground truth, {where}"), (alpha, f"True coverage, {where}")]
+        cards.append(_card("Ground truth", pictures, "colour, coverage", max_side))
     for render in group:
         if name not in render.pack.frames:
             continue
@@ -88,7 +90,8 @@ def _strip(name: str, group: Sequence[Rendered], crops: Sequence[FramePack], max
         if "nb_alpha" in render.pack.layers:
             mask = render.pack.read("nb_alpha", name)
             pictures.append((mask, f"Opacity of the billboards of {render.variant}, {where}"))
-        cards.append(_card(render.variant, pictures, _figures(render.per_image.get(name, {})), max_side))
+        caption = _figures(render.per_image.get(name, {}))
+        cards.append(_card(render.variant, pictures, caption, max_side))
     return Strip(where, cards)
 
 

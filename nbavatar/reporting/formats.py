@@ -1,22 +1,19 @@
-"""Writes a table as csv, Markdown, LaTeX and HTML. All text, nothing computed.
+"""Writes a table as csv, Markdown and LaTeX. All text, nothing computed.
 
 csv         one line a cell: block, row, column, shown text, exact value, mark, and the file, digest and protocol hash
             it comes from; also what the other formats leave out (foreground metrics, all LPIPS nets, trivial answers)
 Markdown    **best**, <u>second</u>, missing cells as an em dash
 LaTeX       a snippet to \\input; needs booktabs, graphicx, subcaption and, for shading, xcolor with option table
-HTML        a <table> fragment, no style of its own
 """
 
 import csv
-import html
 import io
 import json
 import re
-from collections.abc import Iterator
 
-from nbavatar.reporting.cells import COLUMNS, MISSING, Block, Cell, PanelTable, Table, TableLine
+from nbavatar.reporting.cells import COLUMNS, Cell, PanelTable, Table
 
-__all__ = ["to_csv", "to_html", "to_latex", "to_markdown"]
+__all__ = ["plain", "to_csv", "to_latex", "to_markdown"]
 
 _CSV = (
     "table", "panel", "block", "row", "column", "text", "value", "mark", "comparable", "shown", "source", "digest",
@@ -183,54 +180,6 @@ def _latex_heading(column: str) -> str:
 
 def _escape(text: str) -> str:
     return "".join(_SPECIAL.get(letter, letter) for letter in text)
-
-
-def to_html(table: Table) -> str:
-    """HTML fragment: one ``<table>`` a panel inside ``<figure>``, with caption and notes."""
-    parts = [f'<figure class="table" id="table-{html.escape(table.name)}">']
-    parts.append(f"<figcaption><b>{html.escape(table.title)}.</b> {html.escape(table.caption)}</figcaption>")
-    for panel in table.panels:
-        if panel.title:
-            parts.append(f"<h4>{html.escape(panel.title)}</h4>")
-        parts.append(f'<div class="scroll" tabindex="0" role="region" aria-label="{html.escape(table.title)}"><table>')
-        parts.append("<thead>" + "".join(_html_head(table, panel)) + "</thead><tbody>")
-        for block in panel.blocks:
-            kind = f"{block.kind}{'' if block.comparable else ' apart'}"
-            parts.append(
-                f'<tr class="block {kind}"><th colspan="{len(panel.columns) + 1}" scope="rowgroup">'
-                f"{html.escape(block.title)}</th></tr>"
-            )
-            parts.extend(_html_line(panel, block, line) for line in block.lines)
-        parts.append("</tbody></table></div>")
-    if table.notes:
-        parts.append('<ul class="notes">' + "".join(f"<li>{html.escape(note)}</li>" for note in table.notes) + "</ul>")
-    return "\n".join([*parts, "</figure>"])
-
-
-def _html_head(table: Table, panel: PanelTable) -> Iterator[str]:
-    if any(group for group, _ in panel.groups):
-        yield "<tr><th></th>"
-        for group, keys in panel.groups:
-            yield f'<th colspan="{len(keys)}" scope="colgroup">{html.escape(group)}</th>'
-        yield "</tr>"
-    yield f'<tr><th scope="col">{html.escape(table.head)}</th>'
-    for column in panel.columns:
-        yield f'<th scope="col">{html.escape(_heading("", column))}</th>'
-    yield "</tr>"
-
-
-def _html_line(panel: PanelTable, block: Block, line: TableLine) -> str:
-    kind = " ".join(word for word, on in ((block.kind, True), ("rule", line.rule), ("shaded", line.shaded)) if on)
-    cells = []
-    for column in panel.columns:
-        cell = line.cells.get(column, Cell())
-        text = html.escape(cell.text)
-        text = {"best": f"<b>{text}</b>", "second": f"<u>{text}</u>"}.get(cell.mark, text)
-        title = "; ".join([*(source.path for source in cell.sources), *([cell.note] if cell.note else [])])
-        tip = f' title="{html.escape(title, quote=True)}"' if title else ""
-        missing = ' class="missing"' if cell.text == MISSING else ""
-        cells.append(f"<td{missing}{tip}>{text}</td>")
-    return f'<tr class="{kind}"><th scope="row">{html.escape(plain(line.label))}</th>{"".join(cells)}</tr>'
 
 
 def _heading(group: str, column: str) -> str:

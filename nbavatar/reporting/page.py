@@ -90,7 +90,7 @@ def _card(card: Card, identity: str) -> str:
         for i, (address, text) in enumerate(card.pictures)
     )
     caption = f"<b>{html.escape(card.title)}</b>" + (f"<br>{html.escape(card.caption)}" if card.caption else "")
-    return f"<figure>{images}<figcaption>{caption}</figcaption></figure>"
+    return f"<figure><figcaption>{caption}</figcaption>{images}</figure>"
 
 
 def _slider(pictures: Sequence[tuple[str, str]], strip: Strip) -> str:
