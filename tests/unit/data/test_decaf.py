@@ -1,5 +1,6 @@
 import pickle
 
+
 import numpy as np
 import pytest
 
@@ -15,13 +16,14 @@ from nbavatar.data.decaf import (
     read_parameters,
 )
 from nbavatar.errors import DataError
+from nbavatar.io.pickles import read_pickle
 
 PARAMS = "train/params/S2/params_smoothed.pkl"
 CAMERA_FILE = "train/cameras/S2/cameras.pkl"
 
 
 def edit(path, change):
-    content = pickle.loads(path.read_bytes())
+    content = read_pickle(path)
     path.write_bytes(pickle.dumps(change(content) or content, protocol=2))
 
 

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from nbavatar.data.decaf import find_subject, read_camera, read_parameters
 from nbavatar.data.decaf_tracks import build_tracks, frame_id
 from nbavatar.errors import DataError
+from nbavatar.io.pickles import read_pickle
 
 
 def tracks(root, frames=tuple(range(12)), count=12, shape_tolerance=1e-3, rotation_tolerance=1e-3):
@@ -18,7 +19,7 @@ def tracks(root, frames=tuple(range(12)), count=12, shape_tolerance=1e-3, rotati
 
 
 def edit(path, change):
-    content = pickle.loads(path.read_bytes())
+    content = read_pickle(path)
     change(content)
     path.write_bytes(pickle.dumps(content, protocol=2))
 
@@ -104,7 +105,7 @@ def test_head_poses_that_contradict_the_parameters_are_refused(decaf):
     path = decaf / "assets/transformation/train/S2_RT_FromCanToRef_wo_poseparams.npy"
     poses = np.load(path)
     np.save(path, np.roll(poses, 1, axis=0))
-    with pytest.raises(DataError, match="rotation of head.global_orient"):
+    with pytest.raises(DataError, match=r"rotation of head\.global_orient"):
         tracks(decaf)
     path.unlink()
     _, report = tracks(decaf)

@@ -7,7 +7,11 @@ from nbavatar.errors import DataError
 def _sequence(rng, frames=("a", "b", "c")):
     verts = rng.normal(size=(len(frames), 4, 3)).astype(np.float32)
     part = Part(np.array([[0, 1, 2], [0, 2, 3]]), verts[0], verts)
-    extras = {"contact.head": rng.random((len(frames), 4)) > 0.5, "camera.084.K": np.eye(3), "segments": np.array([[0, 2]])}
+    extras = {
+        "contact.head": rng.random((len(frames), 4)) > 0.5,
+        "camera.084.K": np.eye(3),
+        "segments": np.array([[0, 2]]),
+    }
     return MeshSequence(list(frames), {"head": part}, extras)
 
 

@@ -1,0 +1,194 @@
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nbavatar.data.capture import (
+    open_capture,
+    read_coverage,
+    read_mask,
+    read_mesh,
+    read_rgb,
+    read_splits,
+    read_topology,
+)
+from nbavatar.data.capture_tracks import build_capture_tracks
+from nbavatar.data.frame_plan import plan_capture
+from nbavatar.data.sources import capture_images, capture_layers
+from nbavatar.errors import DataError
+
+CHOICE = {"start": 0, "every": 1, "max_frames": 0, "test_fraction": 0.2, "test_blocks": 1}
+
+
+def edit(path, change):
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_cameras_are_read_as_written(capture):
+    camera = open_capture(capture).camera("right")
+    assert (camera.width, camera.height, camera.distortion) == (96, 80, None)
+    assert camera.cam_from_world[2, 3] == 0.6 and camera.K[0, 2] == 49.5
+    assert open_capture(capture, pixel_center=0.0).camera("right").K[0, 2] == 50.0
+    with pytest.raises(DataError, match="no camera 'front'; known: left, right"):
+        open_capture(capture).camera("front")
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda c: c["left"].pop("R"), "camera left: R: expected this key"),
+        (lambda c: c["left"].update(R=[[1, 0, 0], [0, 1, 0], [0, 0, 2]]), "R: expected a rotation"),
+        (lambda c: c["left"].update(R=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "R: expected a rotation"),
+        (lambda c: c["left"].update(K=[[1, 2], [3, 4]]), "K: expected 3 x 3 finite numbers"),
+        (lambda c: c["left"].update(t=[0, None, 1]), "t: expected 3 finite numbers"),
+        (lambda c: c["left"].update(width="96"), "width: expected a whole number of pixels, found '96'"),
+        (lambda c: c["left"].update(K=[[1, 0.1, 3], [0, 1, 3], [0, 0, 1]]), "K: expected"),
+        (lambda c: c["left"].update(distortion=[1, 2]), "distortion: expected 4, 5, 8 or 12"),
+        (lambda c: c.clear(), "expected a mapping from camera name"),
+    ],
+)
+def test_cameras_that_cannot_be(capture, change, line):
+    edit(capture / "cameras.json", change)
+    with pytest.raises(DataError, match=line) as error:
+        open_capture(capture)
+    assert "\n" not in str(error.value) and "cameras.json" in str(error.value)
+
+
+def test_a_split_of_the_user_s_wins_and_else_the_last_fraction_is_held_out(capture):
+    plan = plan_capture(open_capture(capture), **CHOICE)
+    assert list(plan.split.values()) == ["train"] * 4 + ["test"]
+    edit(capture / "splits.json", lambda s: s.update(train=["t0", "t2", "t3"], test=["t1"]))
+    plan = plan_capture(open_capture(capture), **CHOICE)
+    assert plan.split == {"t0": "train", "t1": "test", "t2": "train", "t3": "train"}
+
+
+def test_cuts_divide_runs(capture):
+    edit(capture / "splits.json", lambda s: s.update(cuts=[["t1", "t2"]]))
+    plan = plan_capture(open_capture(capture), **{**CHOICE, "test_fraction": 0.4})
+    assert plan.segments == [(0, 1), (2, 4)]
+    assert list(plan.split.values()) == ["train", "test", "train", "train", "test"]
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda s: s.update(test=["t9"]), "test: expected ids that are in frames, found 't9'"),
+        (lambda s: s.update(train=["t1"], test=["t1"]), "'t1', which is in both"),
+        (lambda s: s.update(frames=[]), "at least one frame id"),
+        (lambda s: s.update(frames=["t1", "t1"]), "each frame once"),
+        (lambda s: s.update(frames=["../t1"]), "file names without their type"),
+        (lambda s: s.update(cuts=["t1"]), "pairs of frame ids"),
+    ],
+)
+def test_splits_that_cannot_be(capture, change, line):
+    edit(capture / "splits.json", change)
+    with pytest.raises(DataError, match=line):
+        read_splits(capture)
+
+
+def test_label_masks_give_labels_and_full_coverage(capture):
+    opened = open_capture(capture)
+    camera, plan = opened.camera("left"), plan_capture(opened, **CHOICE)
+    layers = capture_layers(opened, camera, plan)
+    assert layers == ("rgb", "label", "alpha")
+    for frame, images in capture_images(opened, camera, plan, layers):
+        kind, mask = read_mask(opened, camera, frame)
+        assert kind == "label"
+        np.testing.assert_array_equal(images["label"], mask)
+        np.testing.assert_array_equal(images["alpha"], np.where(mask > 0, 255, 0))
+
+
+def test_alpha_beyond_the_labels_spreads_them(capture):
+    opened = open_capture(capture)
+    camera, plan = opened.camera("left"), plan_capture(opened, **CHOICE)
+    for frame in plan.frames:
+        label = np.array(Image.open(capture / "masks/left" / f"{frame}.png"))
+        alpha = np.where(label > 0, 255, 0).astype(np.uint8)
+        alpha[:12, 40:50] = 77  # hair that nobody labelled
+        alpha[60:, :] = 0
+        path = capture / "alpha/left" / f"{frame}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(alpha).save(path)
+    for frame, images in capture_images(opened, camera, plan, ("rgb", "label", "alpha")):
+        assert ((images["label"] > 0) == (images["alpha"] > 0)).all()
+        assert (images["label"][:5, 40:50] == 1).all() and (images["alpha"][:5, 40:50] == 77).all()
+
+
+def test_person_masks_and_alpha_alone_are_left_for_the_meshes_to_cut(capture):
+    opened = open_capture(capture)
+    camera, plan = opened.camera("left"), plan_capture(opened, **CHOICE)
+    for frame in plan.frames:
+        path = capture / "masks/left" / f"{frame}.png"
+        label = np.array(Image.open(path))
+        Image.fromarray(np.where(label > 0, 255, 0).astype(np.uint8)).save(path)
+    assert capture_layers(opened, camera, plan) == ("rgb", "person")
+    (capture / "masks/left/t2.png").unlink()
+    with pytest.raises(DataError, match=r"masks/left/t2\.png: expected a mask as for the other frames"):
+        capture_layers(opened, camera, plan)
+    (capture / "alpha").mkdir()
+    (capture / "masks" / "left").rename(capture / "alpha" / "left")
+    Image.fromarray(np.zeros((80, 96), np.uint8)).save(capture / "alpha/left/t2.png")
+    assert capture_layers(opened, camera, plan) == ("rgb", "person")
+    frames = dict(capture_images(opened, camera, plan, ("rgb", "person")))
+    np.testing.assert_array_equal(frames["t0"]["person"], read_coverage(opened, camera, "t0"))
+
+
+def test_an_image_of_another_size_or_none(capture):
+    opened = open_capture(capture)
+    camera = opened.camera("left")
+    path = capture / "images/left/t1.png"
+    Image.open(path).resize((50, 40)).save(path)
+    with pytest.raises(DataError, match=r"t1\.png: size: expected 96 x 80 .* found 50 x 40"):
+        read_rgb(opened, camera, "t1")
+    path.unlink()
+    with pytest.raises(DataError, match=r"t1\.jpg: expected an image .* found none"):
+        read_rgb(opened, camera, "t1")
+    path.write_bytes((capture / "images/left/t2.png").read_bytes()[:100])
+    with pytest.raises(DataError, match="does not decode"):
+        read_rgb(opened, camera, "t1")
+
+
+def test_topology_and_vertices_are_checked(capture):
+    topology = read_topology(capture)
+    assert list(topology) == ["head", "right_hand"] and topology["head"][0].dtype == np.int64
+    mesh = dict(np.load(capture / "meshes/t1.npz"))
+    for change, line in [
+        ({"head": mesh["head"] * np.nan}, "head: expected finite coordinates"),
+        ({"head": mesh["head"][:-1]}, "head: expected more than"),
+        ({"head": mesh["head"][:, :2]}, r"head: expected numbers \[V, 3\]"),
+        ({"head_rigid": np.concatenate([mesh["head"]] * 2)}, "head_rigid: expected"),
+    ]:
+        np.savez(capture / "meshes/t1.npz", **{**mesh, **change})
+        with pytest.raises(DataError, match=line):
+            read_mesh(capture, "t1", topology)
+    np.savez(capture / "meshes/t1.npz", head=mesh["head"])
+    with pytest.raises(DataError, match="right_hand: expected an array of this name"):
+        read_mesh(capture, "t1", topology)
+    np.savez(capture / "meshes/topology.npz", faces=np.zeros((1, 3)))
+    with pytest.raises(DataError, match="at least one of head_faces"):
+        read_topology(capture)
+
+
+def test_tracks_take_the_head_without_contact_only_where_it_is_solved(capture):
+    opened = open_capture(capture)
+    frames = [f"t{i}" for i in range(5)]
+    solve, report = build_capture_tracks(opened, frames, contact="solve")
+    given, _ = build_capture_tracks(opened, frames, contact="given")
+    assert report["head"] == "head_rigid" and report["rest"] == {"head": "first frame", "right_hand": "first frame"}
+    np.testing.assert_array_equal(solve.parts["head"].verts, solve.extras["head_rigid"])
+    np.testing.assert_array_equal(given.parts["head"].verts, given.extras["head_final"])
+    assert np.abs(solve.parts["head"].verts - given.parts["head"].verts).max() == pytest.approx(0.001, rel=1e-3)
+    assert set(name for name in solve.extras if name.startswith("camera.left")) == {
+        f"camera.left.{key}" for key in ("K", "cam_from_world", "distortion", "size")
+    }
+
+
+def test_head_rigid_in_some_frames_only_is_refused(capture):
+    mesh = dict(np.load(capture / "meshes/t3.npz"))
+    mesh.pop("head_rigid")
+    np.savez(capture / "meshes/t3.npz", **mesh)
+    with pytest.raises(DataError, match="head_rigid in all frames or in none, found it in 4 of 5"):
+        build_capture_tracks(open_capture(capture), [f"t{i}" for i in range(5)], contact="solve")
