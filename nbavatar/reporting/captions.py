@@ -26,6 +26,7 @@ def describe_protocol(panel: Panel, results: Sequence[tuple[Mapping[str, Any], S
     for result, _ in results:
         by_hash.setdefault(result["protocol_hash"], []).append(result)
     sentences = []
+    remark = " (the paper names no backbone)" if panel.reported else ""
     for digest, group in sorted(by_hash.items()):
         protocol = group[0]["protocol"]
         sizes = sorted({tuple(result["size"]) for result in group})
@@ -35,7 +36,7 @@ def describe_protocol(panel: Panel, results: Sequence[tuple[Mapping[str, Any], S
         sentences.append(
             f"Protocol {protocol['name']} ({digest}): {_SPLITS[protocol['split']]}, crop {protocol['crop']}, "
             f"{', '.join(f'{w} x {h}' for w, h in sizes)} px, {ground} background, {protocol['precision']}; "
-            f"LPIPS by {_NETS[lpips_net]} (the paper names no backbone); {'; '.join(frames)}."
+            f"LPIPS by {_NETS[lpips_net]}{remark}; {'; '.join(frames)}."
         )
     trivial = _describe_trivial([result for result, _ in results])
     return sentences + ([trivial] if trivial else [])
@@ -58,7 +59,7 @@ def _describe_trivial(results: Sequence[Mapping[str, Any]]) -> str:
     return "PSNR of the trivial answers: " + "; ".join(f"{s} {text}" for s, text in sorted(by_subject.items())) + "."
 
 
-def describe_speeds(results: Sequence[tuple[Mapping[str, Any], Source]]) -> list[str]:
+def describe_speeds(panel: Panel, results: Sequence[tuple[Mapping[str, Any], Source]]) -> list[str]:
     """Devices and sizes of timings."""
     if not results:
         return ["No timings yet."]
@@ -67,7 +68,8 @@ def describe_speeds(results: Sequence[tuple[Mapping[str, Any], Source]]) -> list
         size = f", {source.size[0]} x {source.size[1]} px" if source.size else ""
         count = result["speed"].get("billboards")
         seen.append(f"{result.get('device') or 'an unknown device'}{size}" + (f", {count} billboards" if count else ""))
-    return ["Timings reproduced on " + "; ".join(dict.fromkeys(seen)) + " (the paper: 1024 x 1024 px, on an RTX 4090)."]
+    remark = " (the paper: 1024 x 1024 px, on an RTX 4090)" if panel.reported else ""
+    return ["Timings reproduced on " + "; ".join(dict.fromkeys(seen)) + remark + "."]
 
 
 def describe_deviations(

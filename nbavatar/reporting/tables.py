@@ -98,7 +98,7 @@ def build_table(
         notes.extend(describe_deviations(layout, panel, printed))
         used = [results[k] for k in results if k[2] == panel.protocol and k[1] in layout.variants]
         if layout.kind == "speed" or layout.speeds:
-            notes.extend(describe_speeds([results[k] for k in results if k[2] == "" and k[1] in layout.speeds]))
+            notes.extend(describe_speeds(panel, [results[k] for k in results if k[2] == "" and k[1] in layout.speeds]))
         if layout.kind in ("subjects", "mean", "subject"):
             notes.extend(describe_protocol(panel, used, lpips_net))
     return Table(name, layout.title, layout.head, layout.label, _caption(layout), tuple(dict.fromkeys(notes)), panels)
