@@ -307,12 +307,12 @@ def quantise(x: np.ndarray, dtype: type, axis: tuple[int, ...]) -> tuple[np.ndar
     return np.round(x / top * np.iinfo(dtype).max).astype(dtype), top.astype(np.float32)
 
 
-def components(displacement: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Principal directions (V, 3, n) of independent targets (T, V, 3), each scaled to one standard deviation, and the
-    (T, n) coefficients that bring back each target."""
+def components(displacement: np.ndarray, n: int, spread: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Principal directions (V, 3, n) of independent targets (T, V, 3), each scaled to one standard deviation (for
+    targets that have the standard deviation `spread`), and the (T, n) coefficients that bring back each target."""
     flat = displacement.reshape(len(displacement), -1)
     u, s, vt = np.linalg.svd(flat, full_matrices=False)
-    sigma = 0.5 * s[:n]
+    sigma = spread * s[:n]
     directions = (vt[:n] * sigma[:, None]).reshape(n, -1, 3).transpose(1, 2, 0)
     return directions, u[:, :n] * s[:n] / sigma, sigma
 
@@ -366,8 +366,8 @@ def head_part(src: Source, out: dict) -> None:
     for target in shape_targets + macro + wide:
         d = head_rows @ target
         moved.append(d - d.mean(0))
-    shape, _, _ = components(np.array(moved), 60)
-    expression, unit_coefficients, _ = components(np.array([head_rows @ t for t in unit_targets]), 40)
+    shape, _, _ = components(np.array(moved), 60, 0.16)
+    expression, unit_coefficients, _ = components(np.array([head_rows @ t for t in unit_targets]), 40, 0.3)
     weights = src.bone_group({"neck01": 0, "spine01": 0, "spine02": 0, "clavicle.L": 0, "clavicle.R": 0, "neck02": 1, "head": 1, "jaw": 2}, 5)
     weights = np.asarray(head_rows @ weights)
     weights[n_skin:] = 0
@@ -482,7 +482,7 @@ def hand_part(src: Source, out: dict) -> None:
         u, _, vt = np.linalg.svd(b.T @ a)
         rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
         moved.append(b @ rotation - a)
-    shape, _, _ = components(np.array(moved), 10)
+    shape, _, _ = components(np.array(moved), 10, 0.3)
     wrist = np.argsort(np.linalg.norm(template - origin, axis=1))[:60]
     shape -= shape[wrist].mean(0, keepdims=True)
     out["hand.shape"], out["hand.shape_scale"] = quantise(shape, np.int16, (0, 1))

@@ -1,0 +1,371 @@
+"""Per-pixel shading of the synthetic figure: procedural skin, eyes, hair, cloth and room, two lights with soft shadows.
+
+Colours are functions of the rest position (millimetres), so they stick to the surface whatever the mesh's density, and are the
+same from every camera. All in linear light; plain scalar code, compiled.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+__all__ = ["ARM", "CLOTH", "EYE", "HAIR", "HAND", "SKIN", "draw_room", "hairline", "shade"]
+
+SKIN, EYE, HAND, HAIR, CLOTH, ARM = range(6)
+"""Materials of faces."""
+
+_jit = numba.njit(cache=True, nogil=True)
+
+
+@_jit
+def _hash(ix, iy, iz):
+    h = (ix * 374761393 + iy * 668265263 + iz * 1440662683) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
+    return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777215.0
+
+
+@_jit
+def _noise(x, y, z):
+    """Value noise in [-1, 1] on the unit lattice."""
+    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
+    ix, iy, iz = int(fx), int(fy), int(fz)
+    u, v, w = x - fx, y - fy, z - fz
+    u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
+    total = 0.0
+    for a in range(2):
+        for b in range(2):
+            for c in range(2):
+                weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if c else 1 - w)
+                total += weight * _hash(ix + a, iy + b, iz + c)
+    return 2 * total - 1
+
+
+@_jit
+def _step(lo, hi, x):
+    t = min(max((x - lo) / (hi - lo), 0.0), 1.0)
+    return t * t * (3 - 2 * t)
+
+
+@_jit
+def _segment(px, py, ax, ay, bx, by):
+    """Distance to a segment and the parameter along it."""
+    dx, dy = bx - ax, by - ay
+    t = min(max(((px - ax) * dx + (py - ay) * dy) / max(dx * dx + dy * dy, 1e-9), 0.0), 1.0)
+    ex, ey = px - ax - t * dx, py - ay - t * dy
+    return math.sqrt(ex * ex + ey * ey), t
+
+
+@_jit
+def hairline(x, y, z):
+    """How far above the hairline [mm], for the head's rest position."""
+    if z > 0:
+        line = 57.0 + 0.1 * z
+    elif z > -28:
+        line = 57.0 + z * 0.35
+    elif z > -48:
+        line = 47.0 + (z + 28) * 2.1
+    elif z > -82:
+        line = 5.0 + (z + 48) * 0.1
+    elif z > -105:
+        line = 1.6 + (z + 82) * 2.0
+    else:
+        line = -44.4 + (z + 105) * 0.1
+    if abs(x) > 70 and y < 14 and z < -50:
+        line = max(line, 20.0)
+    return y - line
+
+
+@_jit
+def _skin(x, y, z, tone, hair, lips, brow, seed, out):
+    """Colour of the face at rest position (x, y, z) [mm]; returns gloss."""
+    broad = _noise(x / 22 + seed, y / 22, z / 22)
+    blotch = _noise(x / 7 + seed, y / 7 + 9, z / 7)
+    pore = _noise(x / 1.7, y / 1.7 + seed, z / 1.7)
+    red = 0.10 * math.exp(-((abs(x) - 42) ** 2 + (y + 42) ** 2) / (2 * 16.0**2)) + 0.12 * math.exp(-(x * x + (y + 36) ** 2) / (2 * 9.0**2)) * _step(20, 34, z)
+    red += 0.16 * _step(66, 76, abs(x)) + 0.05 * max(blotch, 0.0)
+    light = 1 + 0.06 * broad + 0.05 * blotch + 0.06 * pore
+    shade_eye = 0.16 * math.exp(-((abs(x) - 30) ** 2 / (2 * 13.0**2) + (y + 4) ** 2 / (2 * 8.0**2)))
+    light *= 1 - shade_eye
+    freckle = _noise(x / 2.6 + 40, y / 2.6 + seed, z / 2.6)
+    light *= 1 - 0.35 * _step(0.62, 0.8, freckle) * _step(-65, -10, -abs(y + 25) - abs(x) * 0.3)
+    out[0] = tone[0] * light * (1 + red)
+    out[1] = tone[1] * light * (1 - 0.9 * red)
+    out[2] = tone[2] * light * (1 - 0.9 * red)
+    gloss = 0.35 + 0.35 * math.exp(-(x * x) / (2 * 12.0**2)) * _step(-60, -20, y)
+    front = _step(8, 16, z)
+    # lips: inside the outline, which is given by its upper and lower height over |x|
+    n = len(lips)
+    ax = abs(x)
+    if ax < lips[n - 1, 0] + 2 and front > 0:
+        i = 0
+        while i < n - 2 and ax > lips[i + 1, 0]:
+            i += 1
+        t = min(max((ax - lips[i, 0]) / (lips[i + 1, 0] - lips[i, 0]), 0.0), 1.0)
+        top, bottom = lips[i, 1] + t * (lips[i + 1, 1] - lips[i, 1]), lips[i, 2] + t * (lips[i + 1, 2] - lips[i, 2])
+        inside = min(min(top - y, y - bottom), lips[n - 1, 0] - ax + 1.0)
+        m = _step(-0.7, 0.9, inside) * front
+        crease = 1 + 0.10 * _noise(x / 0.9, y / 6 + seed, 0.0)
+        out[0] = out[0] * (1 - m) + m * crease * (0.35 * tone[0] + 0.20)
+        out[1] = out[1] * (1 - m) + m * crease * 0.42 * tone[1]
+        out[2] = out[2] * (1 - m) + m * crease * 0.50 * tone[2]
+        gloss += 0.5 * m
+        deep = _step(24, 15, z) * _step(-6, 1, inside) * _step(24, 20, ax)
+        out[0] = out[0] * (1 - deep) + deep * 0.05
+        out[1] = out[1] * (1 - deep) + deep * 0.012
+        out[2] = out[2] * (1 - deep) + deep * 0.012
+    if ax < 24 and abs(y + 76) < 20 and z < 12 and z > -90:
+        out[0], out[1], out[2], gloss = 0.045, 0.01, 0.01, 0.2
+    # brows
+    if y > 2 and y < 26 and z > -5:
+        best, along = 1e9, 0.0
+        for i in range(len(brow) - 1):
+            d, t = _segment(ax, y, brow[i, 0], brow[i, 1], brow[i + 1, 0], brow[i + 1, 1])
+            if d < best:
+                best, along = d, (i + t) / (len(brow) - 1)
+        strand = _noise(x / 0.7 + 0.5 * y, y / 3.5, seed)
+        m = _step(4.2 - 2.4 * along, 1.2, best + 0.9 * strand) * 0.9
+        for c in range(3):
+            out[c] = out[c] * (1 - m) + m * hair[c] * 0.7
+        gloss *= 1 - 0.7 * m
+    # scalp
+    m = _step(-2.5, 2.0, hairline(x, y, z) + 2.2 * _noise(x / 3, y / 3, z / 3))
+    if m > 0:
+        for c in range(3):
+            out[c] = out[c] * (1 - m) + m * hair[c]
+        gloss *= 1 - m
+    # lashes and lid rims
+    return gloss
+
+
+@_jit
+def _eye(x, y, z, iris, out):
+    """Colour of an eyeball at unit direction (x, y, z) from its centre; z looks ahead."""
+    r = math.sqrt(x * x + y * y) if z > 0 else 1.0
+    angle = math.atan2(y, x)
+    vein = max(_noise(x * 9, y * 9, z * 5) - 0.25, 0.0) * _step(0.42, 0.9, r)
+    out[0], out[1], out[2] = 0.74, 0.70 - 0.35 * vein, 0.66 - 0.35 * vein
+    m = _step(0.405, 0.375, r)
+    ray = 1 + 0.3 * _noise(angle * 5.0, r * 9, 3.0)
+    rim = 1 - 0.6 * _step(0.31, 0.39, r)
+    for c in range(3):
+        out[c] = out[c] * (1 - m) + m * iris[c] * ray * rim
+    m = _step(0.155, 0.135, r)
+    for c in range(3):
+        out[c] = out[c] * (1 - m) + m * 0.008
+
+
+@_jit
+def _hand_skin(x, y, z, ny, tone, nails, knuckles, seed, out):
+    """Colour of the hand at rest position [mm]; `ny` > 0 on its back; returns gloss."""
+    broad = _noise(x / 15 + seed, y / 15, z / 15)
+    pore = _noise(x / 1.5, y / 1.5, z / 1.5 + seed)
+    vein = math.exp(-((_noise(x / 40 + 3, 0.0, z / 9 + seed)) ** 2) / 0.02) * _step(0.3, 0.8, ny) * _step(-10, 30, x)
+    palm = _step(0.2, -0.5, ny)
+    light = 1 + 0.05 * broad + 0.06 * pore + 0.10 * palm - 0.10 * vein
+    red = 0.06 * palm
+    crease = 0.0
+    for i in range(len(knuckles)):
+        dx, dz = x - knuckles[i, 0], z - knuckles[i, 2]
+        d2 = dx * dx + dz * dz + (y - knuckles[i, 1]) ** 2
+        if d2 < 300:
+            red += 0.12 * math.exp(-d2 / 90)
+            crease = max(crease, math.exp(-d2 / 60) * max(_noise(x / 0.9, z / 7, y / 7), 0.0))
+    light *= 1 - 0.3 * crease
+    out[0], out[1], out[2] = tone[0] * light * (1 + red), tone[1] * light * (1 - 0.8 * red), tone[2] * light * (1 - 0.8 * red)
+    gloss = 0.3
+    for i in range(len(nails)):
+        dx, dy, dz = x - nails[i, 0], y - nails[i, 1], z - nails[i, 2]
+        a = dx * nails[i, 3] + dy * nails[i, 4] + dz * nails[i, 5]
+        h = dx * nails[i, 6] + dy * nails[i, 7] + dz * nails[i, 8]
+        s2 = max(dx * dx + dy * dy + dz * dz - a * a - h * h, 0.0)
+        m = _step(1.15, 0.9, (a / 6.0) ** 2 + s2 / 4.6**2) * _step(0.3, 2.2, h)
+        if m > 0:
+            tip = _step(3.6, 4.6, a)
+            out[0] = out[0] * (1 - m) + m * (0.66 + 0.12 * tip) * (0.5 + 0.55 * tone[0])
+            out[1] = out[1] * (1 - m) + m * (0.42 + 0.28 * tip) * (0.5 + 0.55 * tone[1])
+            out[2] = out[2] * (1 - m) + m * (0.38 + 0.28 * tip) * (0.5 + 0.55 * tone[2])
+            gloss += 1.2 * m
+    return gloss
+
+
+@_jit
+def _room(ox, oy, oz, dx, dy, dz, out):
+    """A studio seen from inside: stage axes [m]."""
+    best, axis = 1e9, 0
+    lo, hi = (-1.9, -0.75, -1.5), (2.1, 2.0, 4.0)
+    o, d = (ox, oy, oz), (dx, dy, dz)
+    for a in range(3):
+        if abs(d[a]) > 1e-9:
+            t = ((hi[a] if d[a] > 0 else lo[a]) - o[a]) / d[a]
+            if t > 0 and t < best:
+                best, axis = t, a
+    x, y, z = ox + best * dx, oy + best * dy, oz + best * dz
+    grain = 1 + 0.05 * _noise(x * 25, y * 25, z * 25)
+    if axis == 1:
+        board = _hash(int(math.floor(x * 6)), 7, 3)
+        out[0], out[1], out[2] = 0.20 + 0.06 * board, 0.14 + 0.04 * board, 0.10 + 0.03 * board
+    elif axis == 2:
+        panel = 1 - 0.45 * _step(0.47, 0.49, abs(x * 1.1 - math.floor(x * 1.1) - 0.5)) - 0.3 * _step(0.48, 0.495, abs(y * 0.9 + 0.3 - math.floor(y * 0.9 + 0.3) - 0.5))
+        glow = math.exp(-((x - 0.7) ** 2 + (y - 1.2) ** 2) / 0.5)
+        out[0], out[1], out[2] = panel * (0.20 + 0.22 * glow), panel * (0.25 + 0.22 * glow), panel * (0.29 + 0.20 * glow)
+    else:
+        shelf = _step(0.46, 0.48, abs(y * 2.2 - math.floor(y * 2.2) - 0.5))
+        book = _hash(int(math.floor(z * 14)), int(math.floor(y * 2.2)), 5)
+        out[0] = 0.10 + 0.30 * book * (1 - shelf)
+        out[1] = 0.09 + 0.22 * _hash(int(math.floor(z * 14)), int(math.floor(y * 2.2)), 8) * (1 - shelf)
+        out[2] = 0.08 + 0.20 * _hash(int(math.floor(z * 14)), int(math.floor(y * 2.2)), 2) * (1 - shelf)
+    for c in range(3):
+        out[c] *= grain
+
+
+@_jit
+def draw_room(k, cam_from_stage, image):
+    """Fills `image` (H, W, 3) float32, linear light, with the empty room; `k` (4,) fx fy cx cy [px]."""
+    height, width = image.shape[:2]
+    r, t = cam_from_stage[:3, :3], cam_from_stage[:3, 3]
+    ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
+    oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
+    oz = -(r[0, 2] * t[0] + r[1, 2] * t[1] + r[2, 2] * t[2])
+    colour = np.zeros(3)
+    for py in range(height):
+        for px in range(width):
+            x, y = (px + 0.5 - k[2]) / k[0], (py + 0.5 - k[3]) / k[1]
+            dx, dy, dz = r[0, 0] * x + r[1, 0] * y + r[2, 0], r[0, 1] * x + r[1, 1] * y + r[2, 1], r[0, 2] * x + r[1, 2] * y + r[2, 2]
+            _room(ox, oy, oz, dx, dy, dz, colour)
+            for c in range(3):
+                image[py, px, c] = colour[c]
+
+
+@_jit
+def _lit(px, py, pz, nx, ny, nz, light, k, from_world, depth, spin):
+    """Share of a light that reaches a point: blocker search, then a filter as wide as the penumbra."""
+    qx, qy, qz = px + nx * 0.0022, py + ny * 0.0022, pz + nz * 0.0022
+    x = from_world[0, 0] * qx + from_world[0, 1] * qy + from_world[0, 2] * qz + from_world[0, 3]
+    y = from_world[1, 0] * qx + from_world[1, 1] * qy + from_world[1, 2] * qz + from_world[1, 3]
+    z = from_world[2, 0] * qx + from_world[2, 1] * qy + from_world[2, 2] * qz + from_world[2, 3]
+    u, v = k[0] * x / z + k[2], k[1] * y / z + k[3]
+    size = depth.shape[0]
+    search = light[3] * 0.035 / z * k[0]
+    blocked, where = 0, 0.0
+    for i in range(10):
+        a, r = spin + 2.399963 * i, math.sqrt((i + 0.5) / 10) * search
+        iu, iv = int(u + r * math.cos(a)), int(v + r * math.sin(a))
+        if iu >= 0 and iv >= 0 and iu < size and iv < size and depth[iv, iu] < z - 0.002:
+            blocked += 1
+            where += depth[iv, iu]
+    if blocked == 0:
+        return 1.0
+    where /= blocked
+    radius = max(light[3] * (z - where) / where / z * k[0], 1.0)
+    lit = 0
+    for i in range(14):
+        a, r = spin + 2.399963 * i, math.sqrt((i + 0.5) / 14) * radius
+        iu, iv = int(u + r * math.cos(a)), int(v + r * math.sin(a))
+        if iu < 0 or iv < 0 or iu >= size or iv >= size or depth[iv, iu] >= z - 0.002 - 0.0004 * radius:
+            lit += 1
+    return lit / 14
+
+
+@_jit
+def shade(
+    face_id, bary, faces, verts, normals, rest, dorsal, occlusion, material, eye, up, lights, light_k,
+    light_from_world, light_depth, colours, lips, brow, eyes, nails, knuckles, seed, image,
+):  # fmt: skip  # noqa: PLR0913, PLR0915
+    """Colours of the pixels that see the figure, written into `image` (H, W, 3) float32, linear light.
+
+    `face_id`, `bary` come from the z-buffer; `verts`, `normals` (V, 3) world; `rest` (V, 3) [mm]; `dorsal` (V,) up-component of the
+    rest normal (1 on the back of the hand); `occlusion` (V,) share of ambient
+    light; `material` (F,); `eye` (3,) the camera's place and `up` (3,), world; `lights` (L, 7): position, radius [m], colour; `colours` (6, 3): skin, hair, iris,
+    shirt, ambient above and below.
+    """
+    height, width = face_id.shape
+    colour = np.zeros(3)
+    for py in range(height):
+        for px in range(width):
+            f = face_id[py, px]
+            if f < 0:
+                continue
+            a, b, c_ = faces[f, 0], faces[f, 1], faces[f, 2]
+            w0, w1, w2 = bary[py, px, 0], bary[py, px, 1], bary[py, px, 2]
+            x = w0 * verts[a, 0] + w1 * verts[b, 0] + w2 * verts[c_, 0]
+            y = w0 * verts[a, 1] + w1 * verts[b, 1] + w2 * verts[c_, 1]
+            z = w0 * verts[a, 2] + w1 * verts[b, 2] + w2 * verts[c_, 2]
+            nx = w0 * normals[a, 0] + w1 * normals[b, 0] + w2 * normals[c_, 0]
+            ny = w0 * normals[a, 1] + w1 * normals[b, 1] + w2 * normals[c_, 1]
+            nz = w0 * normals[a, 2] + w1 * normals[b, 2] + w2 * normals[c_, 2]
+            size = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
+            nx, ny, nz = nx / size, ny / size, nz / size
+            rx = w0 * rest[a, 0] + w1 * rest[b, 0] + w2 * rest[c_, 0]
+            ry = w0 * rest[a, 1] + w1 * rest[b, 1] + w2 * rest[c_, 1]
+            rz = w0 * rest[a, 2] + w1 * rest[b, 2] + w2 * rest[c_, 2]
+            ambient = w0 * occlusion[a] + w1 * occlusion[b] + w2 * occlusion[c_]
+            vx, vy, vz = eye[0] - x, eye[1] - y, eye[2] - z
+            size = math.sqrt(vx * vx + vy * vy + vz * vz)
+            vx, vy, vz = vx / size, vy / size, vz / size
+            facing = nx * vx + ny * vy + nz * vz
+            if facing < 0:
+                # seen from behind (inside of the neck, sleeves): shade the other side
+                nx, ny, nz, facing = -nx, -ny, -nz, -facing
+            kind = material[f]
+            gloss, power, wrap = 0.3, 18.0, 0.25
+            if kind == SKIN:
+                gloss = _skin(rx, ry, rz, colours[0], colours[1], lips, brow, seed, colour)
+            elif kind == EYE:
+                side = 0 if rx > 0 else 1
+                ex, ey, ez = rx - eyes[side, 0], ry - eyes[side, 1], rz - eyes[side, 2]
+                size = max(math.sqrt(ex * ex + ey * ey + ez * ez), 1e-9)
+                _eye(ex / size, ey / size, ez / size, colours[2], colour)
+                gloss, power, wrap = 6.0, 300.0, 0.1
+                ambient *= 0.75
+            elif kind == HAND:
+                back = w0 * dorsal[a] + w1 * dorsal[b] + w2 * dorsal[c_]
+                gloss = _hand_skin(rx, ry, rz, back, colours[0], nails, knuckles, seed, colour)
+            elif kind == HAIR:
+                strand = _noise(rx / 1.1 + 0.12 * ry, ry / 14, rz / 1.1 + 0.12 * ry) + 0.5 * _noise(rx / 4, ry / 20, rz / 4)
+                for c in range(3):
+                    colour[c] = colours[1, c] * max(1 + 0.55 * strand, 0.1)
+                gloss, power, wrap = 0.5 + 0.4 * strand, 24.0, 0.1
+            elif kind == CLOTH:
+                weave = 1 + 0.10 * _noise(rx / 1.6, ry / 1.6, rz / 1.6) + 0.12 * _noise(rx / 30, ry / 12, rz / 30)
+                for c in range(3):
+                    colour[c] = colours[3, c] * weave
+                gloss, power, wrap = 0.02, 6.0, 0.15
+            else:
+                spot = 1 + 0.05 * _noise(rx / 18, ry / 18, rz / 18) + 0.05 * _noise(rx / 1.7, ry / 1.7, rz / 1.7)
+                for c in range(3):
+                    colour[c] = colours[0, c] * spot
+            sky = 0.5 + 0.5 * (nx * up[0] + ny * up[1] + nz * up[2])
+            lr = ambient * (sky * colours[4, 0] + (1 - sky) * colours[5, 0])
+            lg = ambient * (sky * colours[4, 1] + (1 - sky) * colours[5, 1])
+            lb = ambient * (sky * colours[4, 2] + (1 - sky) * colours[5, 2])
+            sr = sg = sb = 0.0
+            spin = 6.2831853 * _hash(px, py, 1)
+            for i in range(len(lights)):
+                lx, ly, lz = lights[i, 0] - x, lights[i, 1] - y, lights[i, 2] - z
+                size = math.sqrt(lx * lx + ly * ly + lz * lz)
+                lx, ly, lz = lx / size, ly / size, lz / size
+                cosine = nx * lx + ny * ly + nz * lz
+                diffuse = max((cosine + wrap) / (1 + wrap), 0.0)
+                if diffuse <= 0:
+                    continue
+                lit = 1.0
+                if cosine > -0.15:
+                    lit = _lit(x, y, z, nx, ny, nz, lights[i], light_k[i], light_from_world[i], light_depth[i], spin)
+                elif cosine <= -0.15:
+                    lit = 0.6
+                # the edge of a shadow on skin is warm: red light scatters furthest
+                soft = 0.35 * lit * (1 - lit) if kind == SKIN or kind == HAND or kind == ARM else 0.0
+                lr += diffuse * lights[i, 4] * min(lit + soft, 1.0)
+                lg += diffuse * lights[i, 5] * lit
+                lb += diffuse * lights[i, 6] * lit
+                hx, hy, hz = lx + vx, ly + vy, lz + vz
+                size = max(math.sqrt(hx * hx + hy * hy + hz * hz), 1e-9)
+                h = max((nx * hx + ny * hy + nz * hz) / size, 0.0)
+                fresnel = 0.04 + 0.5 * (1 - max(facing, 0.0)) ** 5
+                s = gloss * fresnel * (power + 2) / 8 * h**power * lit * max(cosine, 0.0)
+                sr += s * lights[i, 4]
+                sg += s * lights[i, 5]
+                sb += s * lights[i, 6]
+            image[py, px, 0] = colour[0] * lr + sr
+            image[py, px, 1] = colour[1] * lg + sg
+            image[py, px, 2] = colour[2] * lb + sb
