@@ -158,7 +158,7 @@ def evaluate(
     per_image: list[dict] = []
     answers: dict[str, list[dict]] = {}
     seen = {"prediction": hashlib.sha256(), "truth": hashlib.sha256()}
-    cached: dict[str, tuple[Tensor, dict[str, Sequence[Tensor]]]] = {}
+    cached: dict[str, tuple[Tensor, Mapping[str, Sequence[Tensor]]]] = {}
     size: tuple[int, int] | None = None
     first = next(iter(nets), None)
     for pair in pairs:

@@ -31,7 +31,7 @@ def describe_protocol(panel: Panel, results: Sequence[tuple[Mapping[str, Any], S
         protocol = group[0]["protocol"]
         sizes = sorted({tuple(result["size"]) for result in group})
         colour = protocol["background"]
-        ground = {(1.0, 1.0, 1.0): "white", (0.0, 0.0, 0.0): "black"}.get(tuple(map(float, colour)), str(colour))
+        ground = "white" if min(colour) == 1 else "black" if max(colour) == 0 else str(colour)
         frames = sorted({f"{r['subject']} {r['count']} images, frames {r['frames']}" for r in group})
         sentences.append(
             f"Protocol {protocol['name']} ({digest}): {_SPLITS[protocol['split']]}, crop {protocol['crop']}, "

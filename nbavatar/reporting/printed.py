@@ -80,7 +80,7 @@ def deviating_means(
         if len(texts) != len(subjects):
             continue
         mean = recomputed_mean(texts)
-        half_unit = Decimal(1).scaleb(Decimal(cell.text).as_tuple().exponent) / 2
+        half_unit = Decimal(1).scaleb(-len(cell.text.partition(".")[2])) / 2
         if abs(mean - Decimal(cell.text)) > half_unit:
             found.append((row, metric, cell.text, mean))
     return found
