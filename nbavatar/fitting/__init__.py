@@ -1,0 +1,1 @@
+"""Multi-view refit of head and hand models to keypoints and silhouettes."""
