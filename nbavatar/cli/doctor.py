@@ -1,9 +1,9 @@
 """What this machine can do, and what is missing for which stage.
 
-Looks at processors, memory, disk and GPUs, imports every package that any verb needs (which finds missing system libraries
-too), looks for the LPIPS weights and for the body models and the dataset, and prints one line per finding. Nothing is
-changed. Exit code 0 if the synthetic pipeline (`make smoke`) can run, 2 if a package for it is missing; body models and
-dataset are needed for the paper only and do not count. With --json the same as one JSON object on standard output:
+Looks at processors, memory, disk and GPUs, imports every package that any verb needs (which finds missing system
+libraries too), looks for the LPIPS weights and for the body models and the dataset, and prints one line per finding.
+Nothing is changed. Exit code 0 if the synthetic pipeline (`make smoke`) can run, 2 if a package for it is missing; body
+models and dataset are needed for the paper only and do not count. With --json the same as one JSON object:
 
   machine      processors, memory_gb, disk_free_gb, gpus [names]
   packages     module -> version, or null with the reason in `broken`

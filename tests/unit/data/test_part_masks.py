@@ -148,7 +148,7 @@ def test_silhouettes_follow_lens_distortion(tiny, scene):
 
 
 def test_parts_that_are_absent_are_not_looked_for(scene):
-    sequence, camera, mattes, truth = scene
+    sequence, camera, _, _ = scene
     alone = MeshSequence(sequence.frames, {"head": sequence.parts["head"]})
     labels = PartCutter(alone, camera, MARGINS).silhouettes("000000")
     assert set(np.unique(labels.support)) == {0, 1}
