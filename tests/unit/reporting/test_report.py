@@ -1,0 +1,206 @@
+"""The HTML report: self-contained, complete, readable without any of its parts."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nbavatar.cli import main
+from nbavatar.io.framepack import FramePackWriter
+from nbavatar.io.images import encode_png
+from nbavatar.reporting.comparison import find_truth
+from nbavatar.reporting.curves import line_chart, thin
+from nbavatar.reporting.markdown import markdown_to_html
+from nbavatar.reporting.pictures import ERROR_MAX, RAMP, error_map, reduce_picture, spread
+
+SIZE = 32
+VOID = {"meta", "link", "img", "input", "br"}
+
+
+class Page(HTMLParser):
+    """Checks nesting while it collects tags."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.feed(text)
+        assert not self.open, self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def all(self, tag):
+        return [attrs for name, attrs in self.tags if name == tag]
+
+
+def write_pack(path, subject, camera, frames, layers, *, K_at=16.0, record=None, per_frame=False):
+    K = [[40.0, 0, K_at], [0, 40.0, K_at], [0, 0, 1]]
+    manifest = {
+        "stage": "x", "subject": subject, "camera": camera, "width": SIZE, "height": SIZE, "frames": frames,
+        "cam_from_world": None, "layers": dict.fromkeys(layers, ""), "record": record or {}, "background": [1, 1, 1],
+        **({"K_per_frame": dict.fromkeys(frames, K)} if per_frame else {"K": K}),
+    }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(len(str(path)))
+    with FramePackWriter(path, manifest) as pack:
+        for frame in frames:
+            for layer in layers:
+                shape = (SIZE, SIZE, 3) if layer == "rgb" else (SIZE, SIZE)
+                pack.add(layer, frame, rng.integers(0, 256, shape).astype(np.uint8))
+    return str(path)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A small run: two variants, two cameras, tables, histories, one further picture."""
+    frames = [f"{i:04}" for i in range(6)]
+    crops = [write_pack(tmp_path / f"crop/{c}.zip", "S2", c, frames, ("rgb", "alpha")) for c in ("102", "108")]
+    renders, evals, histories = [], [], []
+    for variant in ("full", "no_nb"):
+        names = [f"102/{f}" for f in frames]
+        path = tmp_path / f"render/S2/{variant}/nv1024.zip"
+        record = {"config": {"name": "nv1024"}}
+        renders.append(write_pack(path, "S2", "102", names, ("rgb", "nb_alpha"), record=record, per_frame=True))
+        evals.append(str(tmp_path / f"{variant}.json"))
+        rows = [{"camera": "102", "frame": f, "psnr": 20.5, "ssim": 0.9, "lpips_vgg": 0.1} for f in frames]
+        content = {"subject": "S2", "variant": variant, "protocol": {"name": "nv1024"}, "per_image": rows, "count": 6}
+        content |= {"protocol_hash": "abcdef012345", "record": {"code": "c0de", "device": "cpu: x", "config": {"a": 1}}}
+        Path(evals[-1]).write_text(json.dumps(content))
+        histories.append(str(tmp_path / f"train/S2/{variant}/history.jsonl"))
+        Path(histories[-1]).parent.mkdir(parents=True)
+        lines = [{"step": s, "mse": 1 / (1 + s), "psnr": 10 + s / 10, "progress": s / 50} for s in range(50)]
+        Path(histories[-1]).write_text("\n".join(map(json.dumps, lines)))
+    previews = tmp_path / "train/S2/full/model.pt.state/previews"
+    previews.mkdir(parents=True)
+    (previews / "step_0000050.png").write_bytes(encode_png(np.zeros((20, 30, 3), np.uint8)))
+    (tmp_path / "ablation.md").write_text(
+        "## Ablation <study>\n\n| a | b |\n| --- | ---: |\n| x | **1** |\n\n- note & more\n"
+    )
+    (tmp_path / "ablation.csv").write_text("table\nablation\n")
+    (tmp_path / "S2.png").write_bytes(encode_png(np.full((9, 9, 3), 200, np.uint8)))
+    options = {
+        "--tables": [str(tmp_path / "ablation.md"), str(tmp_path / "ablation.csv")],
+        "--evals": evals, "--renders": renders, "--frames": crops, "--histories": histories,
+        "--pictures": [str(tmp_path / "S2.png")],
+    }  # fmt: skip
+    return tmp_path, options
+
+
+def build(folder, options, *extra):
+    words = [word for name, files in options.items() for word in (name, *files)]
+    assert main(["report", *words, "--out", str(folder / "index.html"), *extra]) == 0
+    return (folder / "index.html").read_text(encoding="utf-8")
+
+
+def test_page_is_self_contained_and_accessible(run):
+    text = build(*run, "--size-label", "smoke size")
+    page = Page(text)
+    assert not re.search(r"(src|href)=[\"'](?!data:|#)", text) and "@import" not in text and "url(" not in text
+    assert all(image.get("alt") and image["src"].startswith("data:image/") for image in page.all("img"))
+    identities = [attrs["id"] for _, attrs in page.tags if attrs.get("id")]
+    assert len(identities) == len(set(identities))
+    assert {f"#{i}" for i in ("tables", "pictures", "training", "stages", "provenance")} == {
+        attrs["href"] for attrs in page.all("a") if attrs["href"].startswith("#")
+    }
+    assert all(attrs["value"] in identities for attrs in page.all("option"))
+    assert page.all("meta")[1]["name"] == "viewport"
+    assert "smoke size: not comparable with the paper" in text and "Ablation &lt;study&gt;" in text
+
+
+def test_page_shows_truth_renders_errors_masks_and_figures(run):
+    text = build(*run, "--cfg", '{"frames": 2}')
+    for words in (
+        "Ground truth, camera 102, frame 0000", "Render of no_nb, camera 102, frame 0005",
+        "Error map of full, camera 102", "Opacity of the billboards of full", "PSNR 20.50, SSIM 0.900, LPIPS 0.100",
+        "PSNR on the training view", "PSNR [dB]", "Training preview of S2/full", "abcdef012345", "ablation.csv",
+    ):  # fmt: skip
+        assert words in text, words
+    assert "frame 0002" not in text
+
+
+def test_every_part_may_be_missing(run):
+    folder, options = run
+    whole = build(folder, options)
+    for name in options:
+        text = build(folder, {key: value for key, value in options.items() if key != name})
+        Page(text)
+        assert len(text) < len(whole)
+    Page(build(folder, {}))
+
+
+def test_same_files_give_the_same_page(run):
+    assert build(*run) == build(*run)
+
+
+def test_missing_file_is_one_line_and_exit_2(tmp_path, capsys):
+    for option in ("--tables", "--evals", "--renders", "--frames", "--histories", "--pictures"):
+        assert main(["report", option, str(tmp_path / "nothing.png"), "--out", str(tmp_path / "i.html")]) == 2
+        error = capsys.readouterr().err.strip()
+        assert "nothing.png" in error and "\n" not in error
+    assert not (tmp_path / "i.html").exists()
+
+
+def test_truth_is_found_by_subject_camera_size_and_intrinsics(tmp_path):
+    from nbavatar.io.framepack import FramePack
+
+    render = FramePack(write_pack(tmp_path / "r.zip", "S2", "*", ["102/f"], ("rgb",), per_frame=True))
+    crops = [
+        FramePack(write_pack(tmp_path / f"{i}.zip", subject, camera, ["f"], ("rgb", "alpha"), K_at=at))
+        for i, (subject, camera, at) in enumerate(
+            [("S1", "102", 16), ("S2", "108", 16), ("S2", "102", 12), ("S2", "102", 16)]
+        )
+    ]
+    assert find_truth(render, "102/f", crops) is crops[3]
+    assert find_truth(render, "102/f", crops[:3]) is None
+
+
+def test_error_map_has_a_fixed_scale_of_rising_lightness():
+    levels = np.linspace(0, 1.2 * ERROR_MAX, 40, dtype=np.float32)
+    truth = np.broadcast_to(1 - levels[None, :, None], (3, 40, 3)).astype(np.float32)
+    shown = error_map(np.full((3, 40, 3), 255, np.uint8), truth).astype(float)
+    assert tuple(shown[0, 0]) == RAMP[0] and tuple(shown[0, -1]) == RAMP[-1]
+    lightness = shown[0] @ (0.2126, 0.7152, 0.0722)
+    assert (np.diff(lightness) >= 0).all() and lightness[-1] > 200
+
+
+def test_small_helpers():
+    assert (
+        spread(list("abcdefg"), 3) == ["a", "d", "g"] and spread(["a"], 3) == ["a"] and spread(list("abc"), 1) == ["b"]
+    )
+    assert reduce_picture(np.zeros((40, 80, 3), np.uint8), 20).shape == (10, 20, 3)
+    same = np.zeros((4, 4), np.uint8)
+    assert reduce_picture(same, 4) is same
+    points = [(float(i), 2.0 * i) for i in range(1000)]
+    thinned = thin(points, 100)
+    assert len(thinned) == 100 and all(y == pytest.approx(2 * x) for x, y in thinned)
+
+
+def test_chart_leaves_out_what_cannot_be_drawn_and_labels_its_axes():
+    series = {"a": [(0.0, 1.0), (1.0, 0.1), (2.0, float("nan"))], "b<": [(0.0, -1.0)]}
+    chart = line_chart("T", series, x_label="step", y_label="loss [1]", log_y=True)
+    assert ">step<" in chart and ">loss [1]<" in chart and "b&lt;" not in chart and "nan" not in chart
+    assert line_chart("T", {"b": [(0.0, -1.0)]}, x_label="x", y_label="y", log_y=True) == ""
+    flat = line_chart("T", {"c": [(0.0, 3.0), (5.0, 3.0)]}, x_label="x", y_label="y")
+    assert "nan" not in flat and "inf" not in flat
+
+
+def test_markdown_of_tables():
+    table = "| h | k |\n| --- | ---: |\n| *block* |  |\n| r | **1** <u>2</u> |\n"
+    text = f"## A\n\npara *i* `c`\n\n{table}\n- n\n\nSources:\n\n- `f`\n"
+    html = markdown_to_html(text + "\n<!-- {} -->\n")
+    assert "<h3>A</h3>" in html and '<tr class="block"><th colspan="2"' in html and "<td><b>1</b> <u>2</u></td>" in html
+    assert "<details><summary>Sources</summary>" in html and "<!--" not in html
+    Page(html)
+    assert "<script>" not in markdown_to_html("<script>alert(1)</script>")
