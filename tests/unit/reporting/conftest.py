@@ -1,0 +1,50 @@
+"""A headless browser for the tests that look at pages."""
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+
+@pytest.fixture(scope="session")
+def browse(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[str, str]]:
+    """``browse(page, screenshot=None, size=(w, h))`` -> (document after its scripts ran, console messages).
+
+    Skips where no Chromium is installed (Debian: apt-get install chromium); this is the only place that does.
+    """
+    program = next((path for path in map(shutil.which, _NAMES) if path), None)
+    if program is None:
+        pytest.skip("no Chromium found")
+    profile = tmp_path_factory.mktemp("chromium")
+
+    def run(page: Path, screenshot: Path | None = None, size: tuple[int, int] = (1200, 900)) -> tuple[str, str]:
+        done = subprocess.run(
+            [
+                program,
+                "--headless",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--hide-scrollbars",
+                "--no-first-run",
+                "--disable-background-networking",
+                "--allow-file-access-from-files",
+                "--enable-logging=stderr",
+                "--virtual-time-budget=4000",
+                f"--user-data-dir={profile}",
+                f"--window-size={size[0]},{size[1]}",
+                *([f"--screenshot={screenshot}"] if screenshot else ["--dump-dom"]),
+                page.as_uri(),
+            ],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=True,
+        )
+        console = "\n".join(line for line in done.stderr.splitlines() if ":CONSOLE" in line)
+        return done.stdout, console
+
+    return run
