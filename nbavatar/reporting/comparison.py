@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from nbavatar.io.framepack import FramePack
+from nbavatar.reporting.insets import contact_window, cut
 from nbavatar.reporting.page import Card, Strip
 from nbavatar.reporting.pictures import data_uri, error_map, reduce_picture, spread
 
@@ -71,33 +72,51 @@ def comparison_strips(
 def _strip(name: str, group: Sequence[Rendered], crops: Sequence[FramePack], max_side: int) -> Strip:
     camera, _, frame = name.partition("/")
     where = f"camera {camera}, frame {frame}"
-    truth = None
+    truth, window = None, None
     cards = []
     crop = find_truth(group[0].pack, name, crops)
     if crop is not None:
         alpha = crop.read("alpha", frame)
         truth = _composite(crop.read("rgb", frame), alpha, group[0].background)
+        window = contact_window(crop.read("label", frame) if "label" in crop.layers else None, alpha)
         picture = np.round(truth * 255).astype(np.uint8)
-        pictures = [(picture, f"Ground truth, {where}"), (alpha, f"True coverage, {where}")]
-        cards.append(_card("Ground truth", pictures, "colour, coverage", max_side))
+        pictures = [
+            (picture, f"Ground truth, {where}"),
+            (cut(picture, window), f"Ground truth at the contact, {where}"),
+        ]
+        pictures.append((alpha, f"True coverage, {where}"))
+        cards.append(_card("Ground truth", pictures, "whole, at the contact, coverage", max_side, window))
     for render in group:
         if name not in render.pack.frames:
             continue
         rgb = render.pack.read("rgb", name)
         pictures = [(rgb, f"Render of {render.variant}, {where}")]
-        if truth is not None and truth.shape == rgb.shape:
-            pictures.append((error_map(rgb, truth), f"Error map of {render.variant}, {where}"))
+        if window is not None:
+            pictures.append((cut(rgb, window), f"Render of {render.variant} at the contact, {where}"))
         if "nb_alpha" in render.pack.layers:
             mask = render.pack.read("nb_alpha", name)
             pictures.append((mask, f"Opacity of the billboards of {render.variant}, {where}"))
+        if truth is not None and truth.shape == rgb.shape:
+            pictures.append((error_map(rgb, truth), f"Error map of {render.variant}, {where}"))
         caption = _figures(render.per_image.get(name, {}))
-        cards.append(_card(render.variant, pictures, caption, max_side))
+        cards.append(_card(render.variant, pictures, caption, max_side, window))
     return Strip(where, cards)
 
 
-def _card(title: str, pictures: Sequence[tuple[np.ndarray, str]], caption: str, max_side: int) -> Card:
-    small = max(pictures[0][0].shape[:2]) <= 128
-    return Card(title, [(data_uri(reduce_picture(p, max_side)), text) for p, text in pictures], caption, small)
+def _card(
+    title: str,
+    pictures: Sequence[tuple[np.ndarray, str]],
+    caption: str,
+    max_side: int,
+    window: tuple[int, int, int, int] | None,
+) -> Card:
+    height, width = pictures[0][0].shape[:2]
+    frame = None
+    if window is not None:
+        x0, y0, x1, y1 = window
+        frame = (x0 / width, y0 / height, (x1 - x0) / width, (y1 - y0) / height)
+    embedded = [(data_uri(reduce_picture(picture, max_side)), text) for picture, text in pictures]
+    return Card(title, embedded, caption, max(height, width) <= 128, frame)
 
 
 def _figures(metrics: Mapping[str, Any]) -> str:

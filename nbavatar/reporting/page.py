@@ -23,12 +23,21 @@ __all__ += ["tables_section"]
 
 @dataclass(frozen=True)
 class Card:
-    """One column of a strip: its title, pictures (data address, alternative text), caption."""
+    """One column of a strip.
+
+    Attributes:
+        title: method.
+        pictures: (data address, alternative text) from top to bottom.
+        caption: figures.
+        small: enlarge without smoothing.
+        window: part of the first picture that the second one enlarges: x, y, width, height as shares of its sides.
+    """
 
     title: str
     pictures: Sequence[tuple[str, str]]
     caption: str = ""
     small: bool = False
+    window: tuple[float, float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -85,12 +94,17 @@ def strips_section(strips: Mapping[str, Sequence[Strip]]) -> str:
 
 def _card(card: Card, identity: str) -> str:
     small = ' class="small"' if card.small else ""
-    images = "".join(
-        f'<img{small} src="{address}" alt="{_safe(text)}"' + (f' id="{identity}"' if i == 0 else "") + ">"
-        for i, (address, text) in enumerate(card.pictures)
-    )
+    images = []
+    for i, (address, text) in enumerate(card.pictures):
+        own = f' id="{identity}"' if i == 0 else ""
+        image = f'<img{small} src="{address}" alt="{_safe(text)}"{own}>'
+        if i == 0 and card.window is not None:
+            names = ("left", "top", "width", "height")
+            place = ";".join(f"{n}:{100 * v:.2f}%" for n, v in zip(names, card.window, strict=True))
+            image = f'<div class="shot">{image}<i style="{place}"></i></div>'
+        images.append(image)
     caption = f"<b>{html.escape(card.title)}</b>" + (f"<br>{html.escape(card.caption)}" if card.caption else "")
-    return f"<figure><figcaption>{caption}</figcaption>{images}</figure>"
+    return f"<figure><figcaption>{caption}</figcaption>{''.join(images)}</figure>"
 
 
 def _slider(pictures: Sequence[tuple[str, str]], strip: Strip) -> str:
