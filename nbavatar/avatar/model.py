@@ -24,10 +24,10 @@ from nbavatar.avatar.region import Region, full_region, paste, region_of, shift_
 from nbavatar.avatar.unet import UNet
 from nbavatar.errors import DataError
 from nbavatar.io.atomic import atomic_write
-from nbavatar.mesh.frames import face_frames
+from nbavatar.mesh.frames import FaceFrames, face_frames
 from nbavatar.raster.functional import render_billboards
 
-__all__ = ["Architecture", "Avatar", "Window", "compose", "load_avatar", "save_avatar"]
+__all__ = ["Anchor", "Architecture", "Avatar", "Window", "compose", "load_avatar", "save_avatar"]
 
 FORMAT = 1
 _KIND = "nbavatar avatar"
@@ -48,6 +48,22 @@ class Architecture:
     roi: bool
     roi_margin: float
     order: str
+
+
+class Anchor(NamedTuple):
+    """Where the billboards of one frame ride; independent of them, so it may be kept while they are trained.
+
+    Attributes:
+        frames: face frames of all parts.
+        quats: rotations of the frames, wxyz (F, 4).
+        keep: indices of the faces whose part is there in this frame, or None for all.
+        penalty: of the refinement, scalar [m^2].
+    """
+
+    frames: FaceFrames
+    quats: Tensor
+    keep: Tensor | None
+    penalty: Tensor
 
 
 class Window(NamedTuple):
@@ -130,15 +146,15 @@ class Avatar(nn.Module):
         counts = torch.tensor([self.face_counts[part] for part in self.parts])
         return torch.repeat_interleave(torch.arange(len(self.parts)), counts)
 
-    def pose(self, verts: Mapping[str, Tensor], frame: str | None = None) -> tuple[Posed, Tensor | None, Tensor]:
-        """Pose the billboards on one frame's meshes.
+    def anchor(self, verts: Mapping[str, Tensor], frame: str | None = None) -> Anchor:
+        """Face frames of one frame's meshes.
 
         Args:
             verts: vertices per part, float (V, 3) [m]; a part that is missing or not finite in this frame is left out.
             frame: id of a training frame, to use its refinement; None: as they are.
 
-        Returns:
-            posed billboards, the indices of those that are there (None: all), and the refinement's penalty.
+        Raises:
+            DataError: a part has another number of vertices.
         """
         present, shown = [], []
         penalty = self.billboards.mu.new_zeros(())
@@ -157,11 +173,21 @@ class Avatar(nn.Module):
             present.append(points)
             shown.append(there)
         frames = face_frames(torch.cat(present), self.faces)
-        posed = self.billboards.pose(frames, anchor_quaternions(frames))
-        if all(shown):
-            return posed, None, penalty
-        keep = torch.tensor(shown)[self.face_groups()].nonzero().squeeze(1).to(self.faces.device)
-        return Posed(*(values[keep] for values in posed)), keep, penalty
+        keep = None
+        if not all(shown):
+            keep = torch.tensor(shown)[self.face_groups()].nonzero().squeeze(1).to(self.faces.device)
+        return Anchor(frames, anchor_quaternions(frames), keep, penalty)
+
+    def place(self, anchor: Anchor) -> tuple[Posed, Tensor | None]:
+        """Billboards in world space, and the indices of those that are there (None: all)."""
+        posed = self.billboards.pose(anchor.frames, anchor.quats)
+        if anchor.keep is None:
+            return posed, None
+        return Posed(*(values[anchor.keep] for values in posed)), anchor.keep
+
+    def pose(self, verts: Mapping[str, Tensor], frame: str | None = None) -> tuple[Posed, Tensor | None]:
+        """Pose the billboards on one frame's meshes: `anchor` and `place`."""
+        return self.place(self.anchor(verts, frame))
 
     def window(
         self,
@@ -179,7 +205,7 @@ class Avatar(nn.Module):
         """Rasterize and decode one view.
 
         Args:
-            posed, keep: from `pose`.
+            posed, keep: from `place` or `pose`.
             viewmat: world to camera (4, 4); K: intrinsics (3, 3) [px]; width, height: image size [px].
             precision: fp32, bf16 or fp16 for the U-Net.
             roi, order: override the avatar's own settings.
@@ -236,7 +262,7 @@ class Avatar(nn.Module):
         **options: Any,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Whole picture: image (3, H, W), alpha (H, W) and the billboards' alpha (H, W); options as in `window`."""
-        posed, keep, _ = self.pose(verts, frame)
+        posed, keep = self.pose(verts, frame)
         window = self.window(posed, keep, viewmat, K, width, height, **options)
         alpha = paste(window.alpha, window.region, width, height)
         nb_alpha = paste(window.nb_alpha, window.region, width, height)

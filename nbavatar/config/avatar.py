@@ -69,6 +69,8 @@ class TrainConfig:
     weight_delta: float = option(0.001, "Weight of the offsets, lambda_Delta.", min=0)
     dice: str = option("milletari", "Form of the Dice loss.", choices=("milletari", "haha"))
     lpips_net: str = option("alex", "Backbone of the training LPIPS.", choices=("alex", "vgg"))
+    lpips_every: int = option(1, "LPIPS in every n-th step only, n times as heavy (it is dear on a CPU).", min=1)
+    lpips_from: float = option(0.0, "Share of training without LPIPS at the start.", min=0, max=1)
     lpips_full_until: float = option(0.1, "Share of training with LPIPS on the whole image, then crops.", min=0, max=1)
     lpips_crop: int = option(256, "Side of the random LPIPS crops [px].", min=32)
 

@@ -120,7 +120,7 @@ def _prepare(avatar: Avatar, sequence: MeshSequence, view: View, device: str) ->
             part: torch.from_numpy(np.asarray(sequence.parts[part].verts[view.row], dtype=np.float32)).to(device)
             for part in avatar.parts
         }
-        posed, keep, _ = avatar.pose(verts)
+        posed, keep = avatar.pose(verts)
         features, alpha = avatar.textures()
         if keep is not None:
             features, alpha = features[keep], alpha[keep]

@@ -7,6 +7,7 @@ gradients are not finite is skipped and counted; several in a row end the traini
 
 import math
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nbavatar.avatar.model import Avatar
+from nbavatar.avatar.model import Anchor, Avatar
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.views import ViewStore, ViewStream
 from nbavatar.errors import NBAvatarError
@@ -26,6 +27,7 @@ __all__ = ["Store", "parameter_groups", "train"]
 
 _LOG_EVERY = 25
 _POSITION = "position"
+_ANCHOR_BYTES = 256_000_000  # most memory for kept face frames
 
 
 class Store(Protocol):
@@ -101,6 +103,7 @@ def train(
     groups = parameter_groups(avatar, config)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.999), fused=True)
     vertices = {part: meshes[part].to(device) for part in avatar.parts}
+    anchors = _Anchors(avatar, vertices)
     clock = _Clock(config)
     step, skipped, in_a_row = 0, 0, 0
     state = store.load()
@@ -134,13 +137,13 @@ def train(
                 checkpoint()
                 return _summary(False, step, clock, skipped, last, count, views)
             progress = clock.progress(step)
-            plan = plan_at(progress, config, side)
+            plan = plan_at(progress, config, side, step)
             _set_rates(optimizer, plan)
             sample = stream.get(step, plan.shrink)
-            posed = {part: vertices[part][sample.view.row] for part in avatar.parts}
+            anchor = anchors.get(sample.view.row, sample.view.frame)
             random = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
             optimizer.zero_grad(set_to_none=True)
-            total, terms, _ = step_loss(avatar, sample, posed, neighbours, lpips, plan, config, random)
+            total, terms, _ = step_loss(avatar, sample, anchor, neighbours, lpips, plan, config, random)
             good = bool(torch.isfinite(total))
             if good:
                 total.backward()
@@ -175,6 +178,29 @@ def train(
         stream.close()
     avatar.eval()
     return _summary(True, step, clock, skipped, last, count, views)
+
+
+class _Anchors:
+    """Face frames of the frames seen last, in bounded memory; computed anew where a refinement moves the meshes."""
+
+    def __init__(self, avatar: Avatar, vertices: Mapping[str, Tensor]) -> None:
+        self._avatar, self._vertices = avatar, vertices
+        size = 17 * avatar.billboards.mu.element_size() * len(avatar.faces)  # T, R, k and the quaternion
+        self._most = 0 if avatar.refinement is not None else max(1, _ANCHOR_BYTES // max(1, size))
+        self._kept: OrderedDict[int, Anchor] = OrderedDict()
+
+    def get(self, row: int, frame: str) -> Anchor:
+        """Anchor of one frame."""
+        if row in self._kept:
+            self._kept.move_to_end(row)
+            return self._kept[row]
+        verts = {part: values[row] for part, values in self._vertices.items()}
+        anchor = self._avatar.anchor(verts, frame)
+        if self._most > 0:
+            self._kept[row] = anchor
+            if len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+        return anchor
 
 
 class _Clock:

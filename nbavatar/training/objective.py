@@ -1,6 +1,6 @@
 """The loss of one training step: the terms of the paper on one view (sections 3.3, 3.4 and 4.1)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from nbavatar.avatar.losses import loss_delta, loss_dice, loss_dice_haha, loss_knn, loss_mse
-from nbavatar.avatar.model import Avatar, Window, compose
+from nbavatar.avatar.model import Anchor, Avatar, Window, compose
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.views import Sample
 from nbavatar.training.schedule import Plan
@@ -50,7 +50,7 @@ def target_in(window: Window, sample: Sample) -> Target:
 def step_loss(
     avatar: Avatar,
     sample: Sample,
-    verts: Mapping[str, Tensor],
+    anchor: Anchor,
     neighbours: Tensor | None,
     lpips: Callable[[Tensor, Tensor], Tensor] | None,
     plan: Plan,
@@ -62,7 +62,7 @@ def step_loss(
     Args:
         avatar: the model.
         sample: the view, at the resolution of the stage.
-        verts: meshes of its frame, per part (V, 3) [m], on the model's device.
+        anchor: where its frame's billboards ride.
         neighbours: int64 [F, K], or None when the neighbour term is off.
         lpips: perceptual distance of two batches, or None when its weight is 0.
         plan: settings of this step.
@@ -75,7 +75,7 @@ def step_loss(
     device = avatar.faces.device
     background = torch.rand(3, generator=random).to(device)
     corner = torch.rand(2, generator=random).tolist()
-    posed, keep, penalty = avatar.pose(verts, sample.view.frame)
+    posed, keep = avatar.place(anchor)
     window = avatar.window(
         posed,
         keep,
@@ -95,9 +95,10 @@ def step_loss(
     pixels = sample.width * sample.height
     terms = {"mse": loss_mse(image, truth, pixels=pixels)}
     weights = {"mse": 1.0}
-    if lpips is not None and config.weight_lpips > 0:
+    if lpips is not None and plan.perceptual:
         terms["lpips"] = _perceptual(lpips, image, truth, plan.crop, corner, pixels)
-        weights["lpips"] = config.weight_lpips
+        # Rarer but heavier: the mean pull is the same.
+        weights["lpips"] = config.weight_lpips * config.lpips_every
     if config.weight_nb > 0:
         if config.dice == "milletari":
             terms["nb"] = loss_dice(nb_alpha, target.alpha, missed=target.missed)
@@ -111,7 +112,7 @@ def step_loss(
         terms["delta"] = loss_delta(avatar.billboards.mu)
         weights["delta"] = config.weight_delta
     if avatar.refinement is not None:
-        terms["refine"] = penalty
+        terms["refine"] = anchor.penalty
         weights["refine"] = config.refine.weight
     total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
     return total, {name: value.detach() for name, value in terms.items()}, window

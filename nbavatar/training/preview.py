@@ -32,7 +32,7 @@ def contact_sheet(avatar: Avatar, samples: Sequence[Sample], meshes: Mapping[str
     with torch.no_grad():
         for sample in samples:
             verts = {part: meshes[part][sample.view.row] for part in avatar.parts}
-            posed, keep, _ = avatar.pose(verts, sample.view.frame)
+            posed, keep = avatar.pose(verts, sample.view.frame)
             camera = sample.view.viewmat.to(device), sample.K.to(device), sample.width, sample.height
             window = avatar.window(posed, keep, *camera)
             place = window.region, sample.width, sample.height

@@ -27,12 +27,14 @@ class Plan(NamedTuple):
         rate: factor on all learning rates.
         position_rate: further factor on the rate of the billboard offsets.
         crop: side of the LPIPS crop [px], or None for the whole image.
+        perceptual: whether LPIPS is computed.
     """
 
     shrink: int
     rate: float
     position_rate: float
     crop: int | None
+    perceptual: bool
 
 
 def total_steps(config: TrainConfig) -> int:
@@ -40,13 +42,14 @@ def total_steps(config: TrainConfig) -> int:
     return config.steps if config.steps is not None else _STEPS[config.schedule]
 
 
-def plan_at(progress: float, config: TrainConfig, side: int) -> Plan:
+def plan_at(progress: float, config: TrainConfig, side: int, step: int = 0) -> Plan:
     """Settings at a point of the training.
 
     Args:
         progress: p in [0, 1].
         config: training options.
         side: shorter side of the full-resolution images [px].
+        step: number of the step, for terms that are not computed in each.
     """
     progress = min(max(progress, 0.0), 1.0)
     shrink, rate = 1, 1.0
@@ -58,4 +61,5 @@ def plan_at(progress: float, config: TrainConfig, side: int) -> Plan:
             turn = (progress - config.decay_from) / max(1.0 - config.decay_from, 1e-9)
             rate = config.final_rate + (1.0 - config.final_rate) * 0.5 * (1.0 + math.cos(math.pi * turn))
     crop = None if progress < config.lpips_full_until or shrink > 1 else config.lpips_crop
-    return Plan(shrink, rate, config.rates.position_final**progress, crop)
+    perceptual = config.weight_lpips > 0 and step % config.lpips_every == 0 and progress >= config.lpips_from
+    return Plan(shrink, rate, config.rates.position_final**progress, crop, perceptual)

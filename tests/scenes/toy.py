@@ -71,7 +71,7 @@ def write_scene(folder: Path, *, size: int = SIZE, empty: bool = False, meshes: 
         manifest = {
             "stage": "crop", "subject": "toy", "camera": f"cam{index}", "width": size, "height": size,
             "K": K.tolist(), "cam_from_world": view.tolist(), "distortion": None, "frames": meshes.frames,
-            "split": {frame: "test" if frame == "f3" and len(meshes.frames) > 1 else "train" for frame in meshes.frames},
+            "split": {f: "test" if f == "f3" and len(meshes.frames) > 1 else "train" for f in meshes.frames},
             "segments": [[0, len(meshes.frames) - 1]], "layers": {"rgb": "", "alpha": "", "label": ""}, "record": {},
         }  # fmt: skip
         packs.append(folder / f"cam{index}.zip")

@@ -9,7 +9,7 @@ from nbavatar.training.schedule import plan_at, total_steps
 def test_paper_schedule_is_the_supplements() -> None:
     config = TrainConfig(schedule="paper")
     assert total_steps(config) == 400_000
-    assert plan_at(0.0, config, 1024) == (1, 1.0, 1.0, None)
+    assert plan_at(0.0, config, 1024) == (1, 1.0, 1.0, None, True)
     assert plan_at(39_999 / 400_000, config, 1024).crop is None
     assert plan_at(40_000 / 400_000, config, 1024).crop == 256
     end = plan_at(1.0, config, 1024)
@@ -33,3 +33,10 @@ def test_crops_wait_for_full_resolution() -> None:
     config = TrainConfig(coarse_until=[0.5], lpips_full_until=0.1, coarse_side=64)
     assert plan_at(0.3, config, 256).crop is None
     assert plan_at(0.6, config, 256).crop == 256
+
+
+def test_lpips_may_be_rare_and_late() -> None:
+    config = TrainConfig(lpips_every=3, lpips_from=0.2)
+    assert [plan_at(0.5, config, 256, step).perceptual for step in range(6)] == [True, False, False] * 2
+    assert not plan_at(0.1, config, 256, 0).perceptual
+    assert not plan_at(0.5, TrainConfig(weight_lpips=0.0), 256, 0).perceptual
