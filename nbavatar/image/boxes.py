@@ -27,8 +27,8 @@ def fill_missing(boxes: np.ndarray) -> np.ndarray:
 def square_window(box: np.ndarray, width: int, height: int, *, pad: float, side: int = 0) -> tuple[int, int, int]:
     """Square window over a box, in whole pixels.
 
-    The window is shifted into the image where it fits; a window larger than the image stays centred on the box
-    and sticks out (what lies outside is black and empty).
+    The window is shifted into the image where it fits. One that is larger than the image holds all of it and sticks out
+    (what lies outside is black and empty).
 
     Args:
         box: x0, y0, x1, y1 [px].
@@ -45,7 +45,7 @@ def square_window(box: np.ndarray, width: int, height: int, *, pad: float, side:
     corner = []
     for low, high, limit in ((x0, x1, width), (y0, y1, height)):
         first = int(np.floor((low + high - side) / 2 + 0.5))
-        corner.append(min(max(first, 0), limit - side) if side <= limit else first)
+        corner.append(min(max(first, min(0, limit - side)), max(0, limit - side)))
     return corner[0], corner[1], side
 
 

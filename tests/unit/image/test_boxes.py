@@ -33,10 +33,12 @@ def test_window_holds_the_box_and_stays_inside_where_it_fits(box, pad):
         assert 0 <= x0 <= 200 - side and 0 <= y0 <= 120 - side
 
 
-def test_window_larger_than_the_image_is_centred_on_the_box():
+def test_window_larger_than_the_image_holds_all_of_it():
     assert square_window(np.array([50, 10, 150, 110.0]), 200, 120, pad=0.1) == (40, 0, 120)
     x0, y0, side = square_window(np.array([50, 10, 150, 110.0]), 200, 120, pad=0.5)
     assert side == 200 and (x0, y0) == (0, -40)
+    assert square_window(np.array([50, 60, 140, 120.0]), 200, 120, pad=0.5) == (5, 0, 180)
+    assert square_window(np.array([50, 90, 200, 120.0]), 200, 120, pad=0.5) == (-25, -45, 300)
 
 
 def test_center_of_full_hd():
