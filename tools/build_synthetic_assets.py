@@ -511,12 +511,17 @@ def hand_part(src: Source, out: dict) -> None:
 
 def torso_part(src: Source, out: dict) -> None:
     """Clothed upper body without head and right arm, only to be seen in the pictures."""
-    centre = src.verts[src.faces].mean(1)
-    q = centre - EYE_ORIGIN
-    low = q[:, 1] + 0.150 + 0.3 * (q[:, 2] + 0.08) < 0.02
     arm = sum(src.weights[b] for b in src.weights if b.startswith(("upperarm", "lowerarm", "wrist", "finger", "metacarpal")) and b.endswith(".R"))
-    keep = low & (centre[:, 1] > 0.18) & (centre[:, 0] > -0.45) & (centre[:, 0] < 0.45) & (arm[src.faces].mean(1) < 0.75)
-    faces, rows = compact(src.faces[keep], src.n)
+    faces, rows = compact(src.faces[src.verts[src.faces].mean(1)[:, 1] > 0.15], src.n)
+    # cut cleanly: three centimetres up the neck, the right arm, the left arm below the elbow, the waist
+    for field in (
+        lambda: 0.03 - (verts[:, 1] - EYE_ORIGIN[1] + 0.150 + 0.3 * (verts[:, 2] - EYE_ORIGIN[2] + 0.08)),
+        lambda: 0.6 - rows @ arm,
+        lambda: 0.42 - verts[:, 0],
+        lambda: verts[:, 1] - 0.18,
+    ):
+        verts = np.asarray(rows @ src.verts)
+        faces, rows, _ = clip(faces, rows, field())
     faces, rows, _ = largest(faces, rows, np.zeros(rows.shape[0], bool))
     verts = np.asarray(rows @ src.verts)
     boundary = np.zeros(len(verts), int)
@@ -526,7 +531,7 @@ def torso_part(src: Source, out: dict) -> None:
             key = tuple(sorted((int(f[i]), int(f[(i + 1) % 3]))))
             edge[key] = edge.get(key, 0) + 1
     boundary[np.unique([i for k, c in edge.items() if c == 1 for i in k])] = -1
-    keep, coarse = collapse(verts, faces, boundary, {0: 900 - int((boundary < 0).sum())}, np.ones(len(verts)))
+    keep, coarse = collapse(verts, faces, boundary, {0: 1100 - int((boundary < 0).sum())}, np.ones(len(verts)))
     out["torso.verts"], out["torso.faces"] = verts[keep], coarse
     out["torso.shoulder"] = src.joint("r-shoulder")
     print("torso", keep.shape, coarse.shape)

@@ -62,7 +62,7 @@ def looks_of(human: Human, subject: Subject) -> Looks:
     q = (points - EYE_ORIGIN) * 1e3
     upper, lower = q[[51, 50, 49, 48]], q[[57, 58, 59, 48]]
     lips = np.stack([np.abs(upper[:, 0]), upper[:, 1], np.interp(np.abs(upper[:, 0]), np.abs(lower[:, 0]), lower[:, 1])], 1)
-    brow = np.stack([np.abs(q[21:16:-1, 0]), q[21:16:-1, 1]], 1)
+    brow = np.stack([np.abs(q[21:16:-1, 0]) + 1.0, q[21:16:-1, 1] - [1.0, 3.0, 4.0, 3.5, 2.5]], 1)
     skin, left, _ = human.part_sizes
     centres = np.stack([human.head[skin : skin + left].mean(0), human.head[skin + left :].mean(0)])
     joints = human.hand_regressor @ human.hand
@@ -96,9 +96,10 @@ def build_figure(scene: Scene) -> Figure:
     lump = 1 + 0.25 * np.sin(q[ids, 0] / 9 + subject.seed % 7) * np.sin(q[ids, 1] / 11) * np.sin(q[ids, 2] / 10)
     lift = subject.hair_length * np.clip(height[ids] / 16, -0.45, 1.0) * lump - 0.001
     torso = human.torso
-    # a collar: the shirt's rim stands off the neck so that a turning head does not bare the seam
-    near = np.exp(-(((torso[:, 0] / 0.075) ** 2 + ((torso[:, 2] - 0.03) / 0.08) ** 2)) ** 2) * (torso[:, 1] > 0.56)
-    torso = torso + near[:, None] * np.stack([0.16 * torso[:, 0], np.full(len(torso), 0.004), 0.16 * (torso[:, 2] - 0.03)], 1)
+    # cloth lies off the skin, and the collar most of all, so that a turning head does not bare the seam
+    rim = torso[:, 1] - EYE_ORIGIN[1] + 0.150 + 0.3 * (torso[:, 2] - EYE_ORIGIN[2] + 0.08)
+    off = 0.006 + 0.007 * np.clip(1 + rim / 0.03, 0, 1)
+    torso = torso + vertex_normals(torso, human.torso_faces) * off[:, None]
     arm_faces = []
     for ring in range(_ARM_RINGS - 1):
         for s in range(_ARM_SIDES):
@@ -135,7 +136,8 @@ def pose_figure(figure: Figure, scene: Scene, n: int) -> tuple[np.ndarray, np.nd
     hand_normals = vertex_normals(hand, human.hand_faces)
     hair = head[figure.hair_ids] + head_normals[figure.hair_ids] * figure.hair_lift[:, None]
     torso = figure.torso @ STAGE_TO_WORLD[:3, :3].T + STAGE_TO_WORLD[:3, 3]
-    shoulder = figure.shoulder @ STAGE_TO_WORLD[:3, :3].T + STAGE_TO_WORLD[:3, 3]
+    inside = figure.shoulder + np.array([0.035, -0.012, 0.0])  # the sleeve starts within the torso
+    shoulder = inside @ STAGE_TO_WORLD[:3, :3].T + STAGE_TO_WORLD[:3, 3]
     verts = np.concatenate([head, hand, hair, torso, _arm(scene, n, shoulder)])
     start = np.concatenate([[0], np.cumsum(figure.counts)])
     normals = np.zeros_like(verts)
@@ -196,7 +198,7 @@ def _arm(scene: Scene, n: int, shoulder: np.ndarray) -> np.ndarray:
         u /= np.linalg.norm(u)
         v = np.cross(tangent[ring], u)
         t = ring / (_ARM_RINGS - 1)
-        a = np.interp(t, [0, 0.3, 0.5, 0.7, 0.88, 1], [0.058, 0.052, 0.046, 0.045, 0.034, wide])
-        b = np.interp(t, [0, 0.3, 0.5, 0.7, 0.88, 1], [0.062, 0.050, 0.044, 0.042, 0.027, thin])
+        a = np.interp(t, [0, 0.3, 0.5, 0.7, 0.88, 1], [0.078, 0.058, 0.048, 0.046, 0.034, wide])
+        b = np.interp(t, [0, 0.3, 0.5, 0.7, 0.88, 1], [0.085, 0.058, 0.046, 0.043, 0.027, thin])
         out[ring] = path[ring] + a * np.cos(angle)[:, None] * u + b * np.sin(angle)[:, None] * v
     return out.reshape(-1, 3)

@@ -19,7 +19,7 @@ from nbavatar.math.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 __all__ = ["CONTACT_DISTANCE", "STAGE_TO_WORLD", "Bodies", "Scene", "build_bodies", "full_scene", "make_scene"]
 
 CONTACT_DISTANCE = 0.004
-"""Surfaces closer than this touch [m]."""
+"""Surfaces closer than this touch, at full size [m]; vertices of the tiny meshes are too far apart for it."""
 
 STAGE_TO_WORLD = np.array([[1.0, 0.0, 0.0, 0.35], [0.0, 0.0, -1.0, 1.10], [0.0, 1.0, 0.0, 0.62], [0.0, 0.0, 0.0, 1.0]])
 """The dataset's world has z up and its origin elsewhere, so that a reader who confuses frames is found out."""
@@ -130,6 +130,9 @@ def make_scene(
     movable = np.zeros(len(rest), bool)
     movable[: human.part_sizes[0]] = True
     movable[human.neck()] = False
+    neck = np.zeros(len(rest), bool)
+    neck[human.neck(0.008)] = True
+    touching = CONTACT_DISTANCE if human.mesh == "full" else 2.5 * CONTACT_DISTANCE
     movable[_lids_and_mouth(human)] = False
     surface = Surface.build(rest, skin, movable)
     wrist = joints_local[:, 0]
@@ -156,8 +159,8 @@ def make_scene(
             offset[n], residual[n] = solved.offset, solved.residual
         if away < 0.2:
             deformed = head_rigid[n] + offset[n]
-            contact_head[n] = (signed_distance(deformed, hand[n], human.hand_faces)[0] < CONTACT_DISTANCE) & movable
-            contact_hand[n] = signed_distance(hand[n], deformed, skin)[0] < CONTACT_DISTANCE
+            contact_head[n] = (signed_distance(deformed, hand[n], human.hand_faces)[0] < touching) & ~neck
+            contact_hand[n] = signed_distance(hand[n], deformed, skin)[0] < touching
     joints = np.einsum("nij,nkj->nki", hand_rotation, joints_local - wrist[:, None]) + hand_shift[:, None]
     landmarks = bodies.flame.landmarks(as_tensor(head_rigid + offset)).numpy()  # type: ignore[misc]
     # MANO turns about its own wrist joint and then translates

@@ -14,39 +14,68 @@ __all__ = ["ARM", "CLOTH", "EYE", "HAIR", "HAND", "SKIN", "draw_room", "hairline
 SKIN, EYE, HAND, HAIR, CLOTH, ARM = range(6)
 """Materials of faces."""
 
-_jit = numba.njit(cache=True, nogil=True)
+_GOLDEN = 2.399963229728653
 
 
-@_jit
+def _disk(count: int) -> np.ndarray:
+    """Points spread evenly over the unit disk (a sunflower)."""
+    i = np.arange(count)
+    radius = np.sqrt((i + 0.5) / count)
+    return np.stack([radius * np.cos(_GOLDEN * i), radius * np.sin(_GOLDEN * i)], 1)
+
+
+_SEARCH, _FILTER = _disk(10), _disk(14)
+
+# No checks for division by zero. One signature a helper: calls with whole numbers would compile it again for each mixture of
+# types, which is most of the time of a first start.
+_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+_jit = numba.njit(**_OPTIONS)
+
+
+def _helper(signature: str):
+    return numba.njit(signature, **_OPTIONS)
+
+
+
+@_helper("f8(i8, i8, i8)")
 def _hash(ix, iy, iz):
     h = (ix * 374761393 + iy * 668265263 + iz * 1440662683) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777215.0
 
 
-@_jit
-def _noise(x, y, z):
-    """Value noise in [-1, 1] on the unit lattice."""
-    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
-    ix, iy, iz = int(fx), int(fy), int(fz)
-    u, v, w = x - fx, y - fy, z - fz
-    u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
-    total = 0.0
-    for a in range(2):
-        for b in range(2):
-            for c in range(2):
-                weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if c else 1 - w)
-                total += weight * _hash(ix + a, iy + b, iz + c)
-    return 2 * total - 1
+@_helper("void(f8[:, ::1], i8, f8[::1])")
+def _noise(points, count, out):
+    """Value noise in [-1, 1] on the unit lattice at `points` (count, 3), into `out`.
+
+    One call for all the noises of a material: the function is inlined wherever it is called, and compiling it once instead of
+    twenty times saves most of the start.
+    """
+    for j in range(count):
+        fx, fy, fz = math.floor(points[j, 0]), math.floor(points[j, 1]), math.floor(points[j, 2])
+        ix, iy, iz = int(fx), int(fy), int(fz)
+        u, v, w = points[j, 0] - fx, points[j, 1] - fy, points[j, 2] - fz
+        u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
+        total = 0.0
+        for i in range(8):
+            a, b, c = i & 1, (i >> 1) & 1, i >> 2
+            weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if c else 1 - w)
+            total += weight * _hash(ix + a, iy + b, iz + c)
+        out[j] = 2 * total - 1
 
 
-@_jit
+@_helper("void(f8[:, ::1], i8, f8, f8, f8)")
+def _put(points, i, x, y, z):
+    points[i, 0], points[i, 1], points[i, 2] = x, y, z
+
+
+@_helper("f8(f8, f8, f8)")
 def _step(lo, hi, x):
     t = min(max((x - lo) / (hi - lo), 0.0), 1.0)
     return t * t * (3 - 2 * t)
 
 
-@_jit
+@_helper("UniTuple(f8, 2)(f8, f8, f8, f8, f8, f8)")
 def _segment(px, py, ax, ay, bx, by):
     """Distance to a segment and the parameter along it."""
     dx, dy = bx - ax, by - ay
@@ -55,7 +84,7 @@ def _segment(px, py, ax, ay, bx, by):
     return math.sqrt(ex * ex + ey * ey), t
 
 
-@_jit
+@_helper("f8(f8, f8, f8)")
 def hairline(x, y, z):
     """How far above the hairline [mm], for the head's rest position."""
     if z > 0:
@@ -76,17 +105,22 @@ def hairline(x, y, z):
 
 
 @_jit
-def _skin(x, y, z, tone, hair, lips, brow, seed, out):
+def _skin(x, y, z, tone, hair, lips, brow, seed, points, noise, out):
     """Colour of the face at rest position (x, y, z) [mm]; returns gloss."""
-    broad = _noise(x / 22 + seed, y / 22, z / 22)
-    blotch = _noise(x / 7 + seed, y / 7 + 9, z / 7)
-    pore = _noise(x / 1.7, y / 1.7 + seed, z / 1.7)
+    _put(points, 0, x / 22 + seed, y / 22, z / 22)
+    _put(points, 1, x / 7 + seed, y / 7 + 9, z / 7)
+    _put(points, 2, x / 1.7, y / 1.7 + seed, z / 1.7)
+    _put(points, 3, x / 2.6 + 40, y / 2.6 + seed, z / 2.6)
+    _put(points, 4, x / 0.9, y / 6 + seed, 0.0)
+    _put(points, 5, x / 0.7 + 0.5 * y, y / 3.5, seed)
+    _put(points, 6, x / 3, y / 3, z / 3)
+    _noise(points, 7, noise)
+    broad, blotch, pore, freckle = noise[0], noise[1], noise[2], noise[3]
     red = 0.10 * math.exp(-((abs(x) - 42) ** 2 + (y + 42) ** 2) / (2 * 16.0**2)) + 0.12 * math.exp(-(x * x + (y + 36) ** 2) / (2 * 9.0**2)) * _step(20, 34, z)
     red += 0.16 * _step(66, 76, abs(x)) + 0.05 * max(blotch, 0.0)
     light = 1 + 0.06 * broad + 0.05 * blotch + 0.06 * pore
     shade_eye = 0.16 * math.exp(-((abs(x) - 30) ** 2 / (2 * 13.0**2) + (y + 4) ** 2 / (2 * 8.0**2)))
     light *= 1 - shade_eye
-    freckle = _noise(x / 2.6 + 40, y / 2.6 + seed, z / 2.6)
     light *= 1 - 0.35 * _step(0.62, 0.8, freckle) * _step(-65, -10, -abs(y + 25) - abs(x) * 0.3)
     out[0] = tone[0] * light * (1 + red)
     out[1] = tone[1] * light * (1 - 0.9 * red)
@@ -104,7 +138,7 @@ def _skin(x, y, z, tone, hair, lips, brow, seed, out):
         top, bottom = lips[i, 1] + t * (lips[i + 1, 1] - lips[i, 1]), lips[i, 2] + t * (lips[i + 1, 2] - lips[i, 2])
         inside = min(min(top - y, y - bottom), lips[n - 1, 0] - ax + 1.0)
         m = _step(-0.7, 0.9, inside) * front
-        crease = 1 + 0.10 * _noise(x / 0.9, y / 6 + seed, 0.0)
+        crease = 1 + 0.10 * noise[4]
         out[0] = out[0] * (1 - m) + m * crease * (0.35 * tone[0] + 0.20)
         out[1] = out[1] * (1 - m) + m * crease * 0.42 * tone[1]
         out[2] = out[2] * (1 - m) + m * crease * 0.50 * tone[2]
@@ -122,13 +156,13 @@ def _skin(x, y, z, tone, hair, lips, brow, seed, out):
             d, t = _segment(ax, y, brow[i, 0], brow[i, 1], brow[i + 1, 0], brow[i + 1, 1])
             if d < best:
                 best, along = d, (i + t) / (len(brow) - 1)
-        strand = _noise(x / 0.7 + 0.5 * y, y / 3.5, seed)
-        m = _step(4.2 - 2.4 * along, 1.2, best + 0.9 * strand) * 0.9
+        strand = noise[5]
+        m = _step(5.4 - 3.0 * along, 1.6 - 0.8 * along, best + 1.1 * strand) * 0.92
         for c in range(3):
             out[c] = out[c] * (1 - m) + m * hair[c] * 0.7
         gloss *= 1 - 0.7 * m
     # scalp
-    m = _step(-2.5, 2.0, hairline(x, y, z) + 2.2 * _noise(x / 3, y / 3, z / 3))
+    m = _step(-2.5, 2.0, hairline(x, y, z) + 2.2 * noise[6])
     if m > 0:
         for c in range(3):
             out[c] = out[c] * (1 - m) + m * hair[c]
@@ -138,14 +172,17 @@ def _skin(x, y, z, tone, hair, lips, brow, seed, out):
 
 
 @_jit
-def _eye(x, y, z, iris, out):
+def _eye(x, y, z, iris, points, noise, out):
     """Colour of an eyeball at unit direction (x, y, z) from its centre; z looks ahead."""
     r = math.sqrt(x * x + y * y) if z > 0 else 1.0
     angle = math.atan2(y, x)
-    vein = max(_noise(x * 9, y * 9, z * 5) - 0.25, 0.0) * _step(0.42, 0.9, r)
+    _put(points, 0, x * 9, y * 9, z * 5)
+    _put(points, 1, angle * 5.0, r * 9, 3.0)
+    _noise(points, 2, noise)
+    vein = max(noise[0] - 0.25, 0.0) * _step(0.42, 0.9, r)
     out[0], out[1], out[2] = 0.74, 0.70 - 0.35 * vein, 0.66 - 0.35 * vein
     m = _step(0.405, 0.375, r)
-    ray = 1 + 0.3 * _noise(angle * 5.0, r * 9, 3.0)
+    ray = 1 + 0.3 * noise[1]
     rim = 1 - 0.6 * _step(0.31, 0.39, r)
     for c in range(3):
         out[c] = out[c] * (1 - m) + m * iris[c] * ray * rim
@@ -155,11 +192,15 @@ def _eye(x, y, z, iris, out):
 
 
 @_jit
-def _hand_skin(x, y, z, ny, tone, nails, knuckles, seed, out):
+def _hand_skin(x, y, z, ny, tone, nails, knuckles, seed, points, noise, out):
     """Colour of the hand at rest position [mm]; `ny` > 0 on its back; returns gloss."""
-    broad = _noise(x / 15 + seed, y / 15, z / 15)
-    pore = _noise(x / 1.5, y / 1.5, z / 1.5 + seed)
-    vein = math.exp(-((_noise(x / 40 + 3, 0.0, z / 9 + seed)) ** 2) / 0.02) * _step(0.3, 0.8, ny) * _step(-10, 30, x)
+    _put(points, 0, x / 15 + seed, y / 15, z / 15)
+    _put(points, 1, x / 1.5, y / 1.5, z / 1.5 + seed)
+    _put(points, 2, x / 40 + 3, 0.0, z / 9 + seed)
+    _put(points, 3, x / 0.9, z / 7, y / 7)
+    _noise(points, 4, noise)
+    broad, pore = noise[0], noise[1]
+    vein = math.exp(-(noise[2] ** 2) / 0.02) * _step(0.3, 0.8, ny) * _step(-10, 30, x)
     palm = _step(0.2, -0.5, ny)
     light = 1 + 0.05 * broad + 0.06 * pore + 0.10 * palm - 0.10 * vein
     red = 0.06 * palm
@@ -169,7 +210,7 @@ def _hand_skin(x, y, z, ny, tone, nails, knuckles, seed, out):
         d2 = dx * dx + dz * dz + (y - knuckles[i, 1]) ** 2
         if d2 < 300:
             red += 0.12 * math.exp(-d2 / 90)
-            crease = max(crease, math.exp(-d2 / 60) * max(_noise(x / 0.9, z / 7, y / 7), 0.0))
+            crease = max(crease, math.exp(-d2 / 60) * max(noise[3], 0.0))
     light *= 1 - 0.3 * crease
     out[0], out[1], out[2] = tone[0] * light * (1 + red), tone[1] * light * (1 - 0.8 * red), tone[2] * light * (1 - 0.8 * red)
     gloss = 0.3
@@ -189,7 +230,7 @@ def _hand_skin(x, y, z, ny, tone, nails, knuckles, seed, out):
 
 
 @_jit
-def _room(ox, oy, oz, dx, dy, dz, out):
+def _room(ox, oy, oz, dx, dy, dz, points, noise, out):
     """A studio seen from inside: stage axes [m]."""
     best, axis = 1e9, 0
     lo, hi = (-1.9, -0.75, -1.5), (2.1, 2.0, 4.0)
@@ -200,7 +241,9 @@ def _room(ox, oy, oz, dx, dy, dz, out):
             if t > 0 and t < best:
                 best, axis = t, a
     x, y, z = ox + best * dx, oy + best * dy, oz + best * dz
-    grain = 1 + 0.05 * _noise(x * 25, y * 25, z * 25)
+    _put(points, 0, x * 25, y * 25, z * 25)
+    _noise(points, 1, noise)
+    grain = 1 + 0.05 * noise[0]
     if axis == 1:
         board = _hash(int(math.floor(x * 6)), 7, 3)
         out[0], out[1], out[2] = 0.20 + 0.06 * board, 0.14 + 0.04 * board, 0.10 + 0.03 * board
@@ -226,18 +269,18 @@ def draw_room(k, cam_from_stage, image):
     ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
     oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
     oz = -(r[0, 2] * t[0] + r[1, 2] * t[1] + r[2, 2] * t[2])
-    colour = np.zeros(3)
+    colour, points, noise = np.zeros(3), np.zeros((8, 3)), np.zeros(8)
     for py in range(height):
         for px in range(width):
             x, y = (px + 0.5 - k[2]) / k[0], (py + 0.5 - k[3]) / k[1]
             dx, dy, dz = r[0, 0] * x + r[1, 0] * y + r[2, 0], r[0, 1] * x + r[1, 1] * y + r[2, 1], r[0, 2] * x + r[1, 2] * y + r[2, 2]
-            _room(ox, oy, oz, dx, dy, dz, colour)
+            _room(ox, oy, oz, dx, dy, dz, points, noise, colour)
             for c in range(3):
                 image[py, px, c] = colour[c]
 
 
 @_jit
-def _lit(px, py, pz, nx, ny, nz, light, k, from_world, depth, spin):
+def _lit(px, py, pz, nx, ny, nz, light, k, from_world, depth, cosine, sine):
     """Share of a light that reaches a point: blocker search, then a filter as wide as the penumbra."""
     qx, qy, qz = px + nx * 0.0022, py + ny * 0.0022, pz + nz * 0.0022
     x = from_world[0, 0] * qx + from_world[0, 1] * qy + from_world[0, 2] * qz + from_world[0, 3]
@@ -247,9 +290,9 @@ def _lit(px, py, pz, nx, ny, nz, light, k, from_world, depth, spin):
     size = depth.shape[0]
     search = light[3] * 0.035 / z * k[0]
     blocked, where = 0, 0.0
-    for i in range(10):
-        a, r = spin + 2.399963 * i, math.sqrt((i + 0.5) / 10) * search
-        iu, iv = int(u + r * math.cos(a)), int(v + r * math.sin(a))
+    for i in range(len(_SEARCH)):
+        a, b = _SEARCH[i, 0] * search, _SEARCH[i, 1] * search
+        iu, iv = int(u + a * cosine - b * sine), int(v + a * sine + b * cosine)
         if iu >= 0 and iv >= 0 and iu < size and iv < size and depth[iv, iu] < z - 0.002:
             blocked += 1
             where += depth[iv, iu]
@@ -258,12 +301,12 @@ def _lit(px, py, pz, nx, ny, nz, light, k, from_world, depth, spin):
     where /= blocked
     radius = max(light[3] * (z - where) / where / z * k[0], 1.0)
     lit = 0
-    for i in range(14):
-        a, r = spin + 2.399963 * i, math.sqrt((i + 0.5) / 14) * radius
-        iu, iv = int(u + r * math.cos(a)), int(v + r * math.sin(a))
+    for i in range(len(_FILTER)):
+        a, b = _FILTER[i, 0] * radius, _FILTER[i, 1] * radius
+        iu, iv = int(u + a * cosine - b * sine), int(v + a * sine + b * cosine)
         if iu < 0 or iv < 0 or iu >= size or iv >= size or depth[iv, iu] >= z - 0.002 - 0.0004 * radius:
             lit += 1
-    return lit / 14
+    return lit / len(_FILTER)
 
 
 @_jit
@@ -279,7 +322,7 @@ def shade(
     shirt, ambient above and below.
     """
     height, width = face_id.shape
-    colour = np.zeros(3)
+    colour, points, noise = np.zeros(3), np.zeros((8, 3)), np.zeros(8)
     for py in range(height):
         for px in range(width):
             f = face_id[py, px]
@@ -309,37 +352,47 @@ def shade(
             kind = material[f]
             gloss, power, wrap = 0.3, 18.0, 0.25
             if kind == SKIN:
-                gloss = _skin(rx, ry, rz, colours[0], colours[1], lips, brow, seed, colour)
+                gloss = _skin(rx, ry, rz, colours[0], colours[1], lips, brow, seed, points, noise, colour)
             elif kind == EYE:
                 side = 0 if rx > 0 else 1
                 ex, ey, ez = rx - eyes[side, 0], ry - eyes[side, 1], rz - eyes[side, 2]
                 size = max(math.sqrt(ex * ex + ey * ey + ez * ez), 1e-9)
-                _eye(ex / size, ey / size, ez / size, colours[2], colour)
+                _eye(ex / size, ey / size, ez / size, colours[2], points, noise, colour)
                 gloss, power, wrap = 6.0, 300.0, 0.1
                 ambient *= 0.75
             elif kind == HAND:
                 back = w0 * dorsal[a] + w1 * dorsal[b] + w2 * dorsal[c_]
-                gloss = _hand_skin(rx, ry, rz, back, colours[0], nails, knuckles, seed, colour)
-            elif kind == HAIR:
-                strand = _noise(rx / 1.1 + 0.12 * ry, ry / 14, rz / 1.1 + 0.12 * ry) + 0.5 * _noise(rx / 4, ry / 20, rz / 4)
-                for c in range(3):
-                    colour[c] = colours[1, c] * max(1 + 0.55 * strand, 0.1)
-                gloss, power, wrap = 0.5 + 0.4 * strand, 24.0, 0.1
-            elif kind == CLOTH:
-                weave = 1 + 0.10 * _noise(rx / 1.6, ry / 1.6, rz / 1.6) + 0.12 * _noise(rx / 30, ry / 12, rz / 30)
-                for c in range(3):
-                    colour[c] = colours[3, c] * weave
-                gloss, power, wrap = 0.02, 6.0, 0.15
+                gloss = _hand_skin(rx, ry, rz, back, colours[0], nails, knuckles, seed, points, noise, colour)
             else:
-                spot = 1 + 0.05 * _noise(rx / 18, ry / 18, rz / 18) + 0.05 * _noise(rx / 1.7, ry / 1.7, rz / 1.7)
+                # hair, cloth and the arm's skin: a base colour and two noises, fine and coarse
+                if kind == HAIR:
+                    _put(points, 0, rx / 1.1 + 0.12 * ry, ry / 14, rz / 1.1 + 0.12 * ry)
+                    _put(points, 1, rx / 4, ry / 20, rz / 4)
+                elif kind == CLOTH:
+                    _put(points, 0, rx / 1.6, ry / 1.6, rz / 1.6)
+                    _put(points, 1, rx / 30, ry / 12, rz / 30)
+                else:
+                    _put(points, 0, rx / 1.7, ry / 1.7, rz / 1.7)
+                    _put(points, 1, rx / 18, ry / 18, rz / 18)
+                _noise(points, 2, noise)
+                if kind == HAIR:
+                    strand = noise[0] + 0.5 * noise[1]
+                    base, factor = 1, max(1 + 0.55 * strand, 0.1)
+                    gloss, power, wrap = 0.5 + 0.4 * strand, 24.0, 0.1
+                elif kind == CLOTH:
+                    base, factor = 3, 1 + 0.10 * noise[0] + 0.12 * noise[1]
+                    gloss, power, wrap = 0.02, 6.0, 0.15
+                else:
+                    base, factor = 0, 1 + 0.05 * noise[0] + 0.05 * noise[1]
                 for c in range(3):
-                    colour[c] = colours[0, c] * spot
+                    colour[c] = colours[base, c] * factor
             sky = 0.5 + 0.5 * (nx * up[0] + ny * up[1] + nz * up[2])
             lr = ambient * (sky * colours[4, 0] + (1 - sky) * colours[5, 0])
             lg = ambient * (sky * colours[4, 1] + (1 - sky) * colours[5, 1])
             lb = ambient * (sky * colours[4, 2] + (1 - sky) * colours[5, 2])
             sr = sg = sb = 0.0
             spin = 6.2831853 * _hash(px, py, 1)
+            spin_c, spin_s = math.cos(spin), math.sin(spin)
             for i in range(len(lights)):
                 lx, ly, lz = lights[i, 0] - x, lights[i, 1] - y, lights[i, 2] - z
                 size = math.sqrt(lx * lx + ly * ly + lz * lz)
@@ -350,7 +403,7 @@ def shade(
                     continue
                 lit = 1.0
                 if cosine > -0.15:
-                    lit = _lit(x, y, z, nx, ny, nz, lights[i], light_k[i], light_from_world[i], light_depth[i], spin)
+                    lit = _lit(x, y, z, nx, ny, nz, lights[i], light_k[i], light_from_world[i], light_depth[i], spin_c, spin_s)
                 elif cosine <= -0.15:
                     lit = 0.6
                 # the edge of a shadow on skin is warm: red light scatters furthest
