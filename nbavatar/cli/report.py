@@ -7,6 +7,7 @@
     --histories  training histories (.jsonl), one a trained avatar, in <subject>/<variant>/; previews in
                  model.pt.state/previews beside them are shown where they exist
     --pictures   further pictures (.png), such as those of the refit and the contact stage
+    --figures    folder for <subject>_<protocol>_<n>.png and .pdf: the same comparisons, for print
     --out        index.html; needs no network and no other file
 
 Every part may be left out; what is not given is not shown.
@@ -25,7 +26,7 @@ from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.images import decode_image
 from nbavatar.io.records import read_json
-from nbavatar.reporting.comparison import Rendered, comparison_strips
+from nbavatar.reporting.comparison import ROWS, Comparison, Rendered, compare_frames, to_strip
 from nbavatar.reporting.page import (
     curves_section,
     page,
@@ -54,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--size-label", default="", metavar="TEXT", help="why figures are not comparable with the paper"
     )
+    parser.add_argument("--figures", metavar="DIR", help="also write the comparisons as PNG and PDF figures here")
     parser.add_argument("--out", required=True, metavar="HTML", help="page to write")
     add_cfg_argument(parser, ReportConfig)
 
@@ -66,7 +68,13 @@ def main(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         renders = _renders([stack.enter_context(FramePack(path)) for path in args.renders], evals)
         crops = [stack.enter_context(FramePack(path)) for path in args.frames]
-        strips = comparison_strips(renders, crops, frames=cfg.frames, max_side=cfg.max_side)
+        comparisons = compare_frames(renders, crops, frames=cfg.frames)
+    strips = {
+        f"{subject}, protocol {protocol}": [to_strip(comparison, max_side=cfg.max_side) for comparison in group]
+        for (subject, protocol), group in comparisons.items()
+    }
+    if args.figures:
+        _write_figures(Path(args.figures), comparisons)
     sections = [
         ("tables", "Tables", tables_section(_tables(args.tables))),
         ("pictures", "Comparison with the truth", strips_section(strips) if strips else ""),
@@ -106,6 +114,23 @@ def _renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[Rende
         per_image = figures.get((manifest["subject"], variant, protocol), {})
         found.append(Rendered(manifest["subject"], variant, protocol, background, pack, per_image))
     return found
+
+
+def _write_figures(folder: Path, comparisons: dict[tuple[str, str], list[Comparison]]) -> None:
+    from nbavatar.reporting.figures import comparison_figure, save_figure
+
+    for (subject, protocol), group in comparisons.items():
+        for number, comparison in enumerate(group):
+            rows = [row for row in ROWS if any(row in column.pictures for column in comparison.columns)]
+            figure = comparison_figure(
+                [column.title for column in comparison.columns],
+                [[column.pictures.get(row) for column in comparison.columns] for row in rows],
+                rows,
+                error_row="error" in rows,
+            )
+            for suffix in ("png", "pdf"):
+                with atomic_write(folder / f"{subject}_{protocol}_{number}.{suffix}") as path:
+                    save_figure(figure, path)
 
 
 def _training(paths: list[str], cfg: ReportConfig) -> str:

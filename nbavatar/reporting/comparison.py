@@ -1,4 +1,4 @@
-"""Comparison strips: truth, every method's render, its error map and its billboards' opacity, frame by frame."""
+"""Comparisons frame by frame: truth, every method's render, a zoom at the contact, billboard opacity, error map."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,15 @@ from nbavatar.reporting.insets import contact_window, cut
 from nbavatar.reporting.page import Card, Strip
 from nbavatar.reporting.pictures import data_uri, error_map, reduce_picture, spread
 
-__all__ = ["Rendered", "comparison_strips", "find_truth"]
+__all__ = ["ROWS", "Column", "Comparison", "Rendered", "compare_frames", "find_truth", "to_strip"]
+
+ROWS = ("whole", "contact", "coverage", "error")
+_WORDS = {
+    "whole": "{} ({})",
+    "contact": "{} at the contact ({})",
+    "coverage": "coverage of {} ({})",
+    "error": "error map of {} ({})",
+}
 
 
 @dataclass(frozen=True)
@@ -24,6 +32,25 @@ class Rendered:
     background: Sequence[float]
     pack: FramePack
     per_image: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One method's pictures by row of ``ROWS``, uint8 [H, W, 3] or [H, W]; what it has not is absent."""
+
+    title: str
+    pictures: Mapping[str, np.ndarray]
+    figures: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One frame of one camera; the window (x0, y0, x1, y1) [px] is what the row ``contact`` enlarges."""
+
+    camera: str
+    frame: str
+    columns: Sequence[Column]
+    window: tuple[int, int, int, int] | None
 
 
 def find_truth(render: FramePack, name: str, crops: Sequence[FramePack]) -> FramePack | None:
@@ -49,74 +76,71 @@ def find_truth(render: FramePack, name: str, crops: Sequence[FramePack]) -> Fram
     return None
 
 
-def comparison_strips(
-    renders: Sequence[Rendered], crops: Sequence[FramePack], *, frames: int, max_side: int
-) -> dict[str, list[Strip]]:
-    """Strips by heading (subject and protocol).
+def compare_frames(
+    renders: Sequence[Rendered], crops: Sequence[FramePack], *, frames: int
+) -> dict[tuple[str, str], list[Comparison]]:
+    """Comparisons by (subject, protocol).
 
     Args:
         renders: every method's renders, in the order of the columns.
-        crops: ground-truth crops; without the right one a strip has no truth and no error maps.
-        frames: strips per heading, evenly spread over the frames of the first method.
-        max_side: pictures are reduced to this side [px].
+        crops: ground-truth crops; without the right one there is no truth, no zoom and no error map.
+        frames: how many, evenly spread over the frames of the first method.
     """
-    groups: dict[str, list[Rendered]] = {}
+    groups: dict[tuple[str, str], list[Rendered]] = {}
     for render in renders:
-        groups.setdefault(f"{render.subject}, protocol {render.protocol}", []).append(render)
+        groups.setdefault((render.subject, render.protocol), []).append(render)
     return {
-        heading: [_strip(name, group, crops, max_side) for name in spread(group[0].pack.frames, frames)]
-        for heading, group in groups.items()
+        key: [_compare(name, group, crops) for name in spread(group[0].pack.frames, frames)]
+        for key, group in groups.items()
     }
 
 
-def _strip(name: str, group: Sequence[Rendered], crops: Sequence[FramePack], max_side: int) -> Strip:
+def _compare(name: str, group: Sequence[Rendered], crops: Sequence[FramePack]) -> Comparison:
     camera, _, frame = name.partition("/")
-    where = f"camera {camera}, frame {frame}"
     truth, window = None, None
-    cards = []
+    columns = []
     crop = find_truth(group[0].pack, name, crops)
     if crop is not None:
         alpha = crop.read("alpha", frame)
         truth = _composite(crop.read("rgb", frame), alpha, group[0].background)
         window = contact_window(crop.read("label", frame) if "label" in crop.layers else None, alpha)
         picture = np.round(truth * 255).astype(np.uint8)
-        pictures = [
-            (picture, f"Ground truth, {where}"),
-            (cut(picture, window), f"Ground truth at the contact, {where}"),
-        ]
-        pictures.append((alpha, f"True coverage, {where}"))
-        cards.append(_card("Ground truth", pictures, "whole, at the contact, coverage", max_side, window))
+        columns.append(
+            Column("Ground truth", {"whole": picture, "contact": cut(picture, window), "coverage": alpha}, {})
+        )
     for render in group:
         if name not in render.pack.frames:
             continue
         rgb = render.pack.read("rgb", name)
-        pictures = [(rgb, f"Render of {render.variant}, {where}")]
+        pictures = {"whole": rgb}
         if window is not None:
-            pictures.append((cut(rgb, window), f"Render of {render.variant} at the contact, {where}"))
+            pictures["contact"] = cut(rgb, window)
         if "nb_alpha" in render.pack.layers:
-            mask = render.pack.read("nb_alpha", name)
-            pictures.append((mask, f"Opacity of the billboards of {render.variant}, {where}"))
+            pictures["coverage"] = render.pack.read("nb_alpha", name)
         if truth is not None and truth.shape == rgb.shape:
-            pictures.append((error_map(rgb, truth), f"Error map of {render.variant}, {where}"))
-        caption = _figures(render.per_image.get(name, {}))
-        cards.append(_card(render.variant, pictures, caption, max_side, window))
+            pictures["error"] = error_map(rgb, truth)
+        columns.append(Column(render.variant, pictures, render.per_image.get(name, {})))
+    return Comparison(camera, frame, columns, window)
+
+
+def to_strip(comparison: Comparison, *, max_side: int) -> Strip:
+    """A comparison as a strip of the page, its pictures reduced to ``max_side`` [px] and embedded."""
+    where = f"camera {comparison.camera}, frame {comparison.frame}"
+    cards = []
+    for column in comparison.columns:
+        height, width = column.pictures["whole"].shape[:2]
+        frame = None
+        if comparison.window is not None:
+            x0, y0, x1, y1 = comparison.window
+            frame = (x0 / width, y0 / height, (x1 - x0) / width, (y1 - y0) / height)
+        pictures = [
+            (data_uri(reduce_picture(column.pictures[row], max_side)), _WORDS[row].format(column.title, where))
+            for row in ROWS
+            if row in column.pictures
+        ]
+        caption = _figures(column.figures) or ("whole, at the contact, coverage" if frame else "")
+        cards.append(Card(column.title, pictures, caption, max(height, width) <= 128, frame))
     return Strip(where, cards)
-
-
-def _card(
-    title: str,
-    pictures: Sequence[tuple[np.ndarray, str]],
-    caption: str,
-    max_side: int,
-    window: tuple[int, int, int, int] | None,
-) -> Card:
-    height, width = pictures[0][0].shape[:2]
-    frame = None
-    if window is not None:
-        x0, y0, x1, y1 = window
-        frame = (x0 / width, y0 / height, (x1 - x0) / width, (y1 - y0) / height)
-    embedded = [(data_uri(reduce_picture(picture, max_side)), text) for picture, text in pictures]
-    return Card(title, embedded, caption, max(height, width) <= 128, frame)
 
 
 def _figures(metrics: Mapping[str, Any]) -> str:

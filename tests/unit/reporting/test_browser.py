@@ -91,7 +91,7 @@ def test_pictures_load_sliders_move_and_nothing_complains(report, browse):
     assert console == ""
     assert found["images"] >= 8 and found["broken"] == 0
     assert found["moved"] == pytest.approx(0.3 * found["width"], abs=1.5)
-    assert found["changed"] and found["alt"] == "Render of no_nb, camera 102, frame f"
+    assert found["changed"] and found["alt"] == "no_nb (camera 102, frame f)"
     assert found["texts"] > 10 and found["cut"] == 0
 
 

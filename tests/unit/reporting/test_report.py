@@ -10,7 +10,7 @@ import pytest
 
 from nbavatar.cli import main
 from nbavatar.io.framepack import FramePackWriter
-from nbavatar.io.images import encode_png
+from nbavatar.io.images import decode_image, encode_png
 from nbavatar.reporting.comparison import find_truth
 from nbavatar.reporting.curves import line_chart, thin
 from nbavatar.reporting.markdown import markdown_to_html
@@ -122,8 +122,8 @@ def test_page_is_self_contained_and_accessible(run):
 def test_page_shows_truth_renders_errors_masks_and_figures(run):
     text = build(*run, "--cfg", '{"frames": 2}')
     for words in (
-        "Ground truth, camera 102, frame 0000", "Render of no_nb, camera 102, frame 0005",
-        "Error map of full, camera 102", "Opacity of the billboards of full", "PSNR 20.50, SSIM 0.900, LPIPS 0.100",
+        "Ground truth (camera 102, frame 0000)", "no_nb (camera 102, frame 0005)", "full at the contact (camera 102",
+        "error map of full (camera 102", "coverage of full (camera 102", "PSNR 20.50, SSIM 0.900, LPIPS 0.100",
         "PSNR on the training view", "PSNR [dB]", "Training preview of S2/full", "abcdef012345", "ablation.csv",
     ):  # fmt: skip
         assert words in text, words
@@ -138,6 +138,20 @@ def test_every_part_may_be_missing(run):
         Page(text)
         assert len(text) < len(whole)
     Page(build(folder, {}))
+
+
+def test_figures_for_print(run):
+    folder, options = run
+    build(folder, options, "--figures", str(folder / "figures"), "--cfg", '{"frames": 1}')
+    names = sorted(path.name for path in (folder / "figures").iterdir())
+    assert names == ["S2_nv1024_0.pdf", "S2_nv1024_0.png"]
+    first = {path.name: path.read_bytes() for path in (folder / "figures").iterdir()}
+    assert first["S2_nv1024_0.pdf"].startswith(b"%PDF")
+    shown = decode_image(first["S2_nv1024_0.png"])
+    # Three columns and four rows of pictures; a truth, two renders, two error maps.
+    assert shown.shape[0] > 900 and (shown < 250).any(axis=-1).mean() > 0.4
+    build(folder, options, "--figures", str(folder / "figures"), "--cfg", '{"frames": 1}')
+    assert {path.name: path.read_bytes() for path in (folder / "figures").iterdir()} == first
 
 
 def test_same_files_give_the_same_page(run):

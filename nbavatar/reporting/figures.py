@@ -1,0 +1,101 @@
+"""Figures for print, PNG and PDF, by matplotlib (imported where a figure is drawn)."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nbavatar.reporting.curves import PALETTE
+from nbavatar.reporting.pictures import ERROR_MAX, RAMP
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["comparison_figure", "save_figure", "sensitivity_figure"]
+
+_AXES = (
+    ("psnr", "PSNR [dB]"),
+    ("ssim", "SSIM [1]"),
+    ("lpips_alex", "LPIPS, AlexNet [1]"),
+    ("lpips_vgg", "LPIPS, VGG16 [1]"),
+)
+
+
+def sensitivity_figure(rows: Sequence[Mapping[str, Any]]) -> "Figure":
+    """One panel a metric, one dot a protocol setting, a line at the base.
+
+    Args:
+        rows: result of ``nbavatar.evaluation.sensitivity.sweep``, the base first.
+    """
+    from matplotlib.figure import Figure
+
+    metrics = [(key, label) for key, label in _AXES if key in rows[0]]
+    figure = Figure(figsize=(2.2 + 2.3 * len(metrics), 0.8 + 0.26 * len(rows)), layout="constrained")
+    axes = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
+    factors = list(dict.fromkeys(str(row["factor"]) for row in rows))
+    colours = {factor: "#444444" if factor == "base" else PALETTE[i % len(PALETTE)] for i, factor in enumerate(factors)}
+    positions = np.arange(len(rows))[::-1]
+    for axis, (key, label) in zip(axes, metrics, strict=True):
+        values = [row[key] for row in rows]
+        axis.axvline(values[0], color="#444444", linewidth=0.8, linestyle=":")
+        axis.hlines(positions, values[0], values, color=[colours[row["factor"]] for row in rows], linewidth=1.5)
+        axis.scatter(values, positions, color=[colours[row["factor"]] for row in rows], s=28, zorder=3)
+        axis.set_xlabel(label)
+        axis.grid(axis="x", linewidth=0.4, alpha=0.6)
+        axis.margins(x=0.12)
+        axis.spines[["top", "right"]].set_visible(False)
+    names = [str(r["setting"]) if r["factor"] == "base" else f"{r['factor']}: {r['setting']}" for r in rows]
+    axes[0].set_yticks(positions, names)
+    return figure
+
+
+def comparison_figure(
+    columns: Sequence[str], rows: Sequence[Sequence[np.ndarray | None]], row_names: Sequence[str], *, error_row: bool
+) -> "Figure":
+    """A grid of pictures: one column a method, rows such as render, zoom, billboard mask, error.
+
+    Args:
+        columns: headings.
+        rows: pictures uint8 [H, W, 3] or [H, W], None where a method has none.
+        row_names: names of the rows, at the left.
+        error_row: the last row holds error maps; a colour bar says their scale.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+    from matplotlib.figure import Figure
+
+    cell = 1.45
+    figure = Figure(figsize=(cell * len(columns) + 0.9, cell * len(rows) + 0.4), layout="constrained", dpi=200)
+    axes = figure.subplots(len(rows), len(columns), squeeze=False)
+    for line, (pictures, row_name) in enumerate(zip(rows, row_names, strict=True)):
+        for column, picture in enumerate(pictures):
+            axis = axes[line, column]
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if picture is None:
+                axis.axis("off")
+            else:
+                small = max(picture.shape[:2]) <= 128
+                axis.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest" if small else "antialiased")
+                axis.spines[:].set_color("#999999")
+            if line == 0:
+                axis.set_title(columns[column], fontsize=9)
+            if column == 0:
+                axis.set_ylabel(row_name, fontsize=8)
+                if picture is None:
+                    axis.axis("on")
+                    axis.spines[:].set_visible(False)
+    if error_row:
+        ramp = LinearSegmentedColormap.from_list("error", [tuple(v / 255 for v in colour) for colour in RAMP])
+        bar = figure.colorbar(ScalarMappable(Normalize(0, ERROR_MAX), ramp), ax=axes[-1, :].tolist(), shrink=0.9)
+        bar.set_label("|error|, sRGB [1]", fontsize=7)
+        bar.ax.tick_params(labelsize=7)
+    return figure
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Writes a figure in the format of the path's suffix, without time stamps: equal figures are equal files."""
+    none = {"png": {"Software": None}, "pdf": {"CreationDate": None, "Producer": None, "Creator": None}}
+    kind = path.suffix.lstrip(".")
+    figure.savefig(path, format=kind, metadata=none.get(kind), bbox_inches="tight")
