@@ -30,6 +30,7 @@ class FitConfig:
     pose_floor_deg: float = option(
         1.0, "Smallest prior deviation of finger angles in any direction [degrees].", min=1.0e-6
     )
+    anchor_deg: float = option(3.0, "Deviation expected of the dataset's finger angles [degrees].", min=1.0e-6)
     smooth_rotation_deg: float = option(2.0, "Typical angular acceleration, 0 for none [degrees / frame^2].", min=0.0)
     smooth_transl_mm: float = option(3.0, "Typical acceleration, 0 for no smoothness [mm / frame^2].", min=0.0)
     smooth_pose_deg: float = option(
@@ -53,6 +54,39 @@ class SpectralConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DeformConfig:
-    """Contact deformation of the head by the hand (XPBD)."""
+    """Contact deformation of the head by the hands (XPBD). Stiffness 0 switches a term off."""
 
-    substeps: int = option(8, "Sub-steps per frame.", min=1)
+    stiffness: str = option(
+        "auto",
+        "Stiffness under the skin: the user's array `stiffness.head` in the meshes [N/m^3] (data), the distance to a "
+        "skull proxy (anatomical), the same everywhere (uniform); auto takes data where there is some, else anatomical.",
+        choices=("auto", "data", "anatomical", "uniform"),
+    )
+    modulus: float = option(1.0e4, "Young's modulus of soft tissue [Pa].", min=0.0, max=1.0e12)
+    uniform_thickness: float = option(0.012, "Tissue thickness where stiffness is uniform [m].", min=1.0e-4, max=1.0)
+    stretch: float = option(30.0, "Stiffness of an edge of the skin [N/m].", min=0.0, max=1.0e12)
+    shear: float = option(
+        300.0, "Stiffness by which neighbouring points of the skin move along with each other [N/m].",
+        min=0.0, max=1.0e12,
+    )  # fmt: skip
+    bending: float = option(1.0e-5, "Flexural rigidity of the skin [N m].", min=0.0, max=1.0e12)
+    volume: float = option(0.0, "Resistance of the pressed region to loss of volume [N/m^5].", min=0.0, max=1.0e18)
+    friction: float = option(0.3, "Coulomb friction of a hand on skin.", min=0.0, max=10.0)
+    reach: float = option(0.05, "How far from a contact the skin moves, along the surface [m].", min=0.0, max=1.0)
+    max_dent: float = option(0.035, "Longest way a point of the skin may move [m].", min=0.0, max=1.0)
+    hand_stiffness: float = option(1.0e4, "How firmly the track holds a hand's position [N/m].", min=0.0, max=1.0e12)
+    hand_turn_stiffness: float = option(
+        10.0, "How firmly the track holds a hand's rotation [N m].", min=0.0, max=1.0e12
+    )
+    hand_shift: float = option(0.004, "Bound of the correction of a hand's position; 0 keeps it [m].", min=0.0, max=0.1)
+    hand_turn: float = option(0.05, "Bound of the correction of a hand's rotation; 0 keeps it [rad].", min=0.0, max=1.0)
+    touch: float = option(0.002, "Nearer than this is contact [m].", min=0.0, max=0.1)
+    tolerance: float = option(
+        1.0e-4, "Depth up to which a vertex may be left inside the other part [m].", min=1.0e-6, max=0.01
+    )
+    step: float = option(0.003, "Longest step of a hand's path through a frame [m].", min=1.0e-4, max=0.1)
+    max_steps: int = option(16, "Most steps of a hand's path through a frame.", min=1, max=1000)
+    settle: int = option(4, "Steps after the hand has arrived.", min=0, max=1000)
+    iterations: int = option(8, "Sweeps over all constraints in a step.", min=1, max=10000)
+    time_step: float = option(0.002, "Time that a step stands for: longer is nearer to rest [s].", min=1.0e-6, max=1.0)
+    picture_size: int = option(480, "Side of one view of the validation picture [px].", min=64, max=4096)

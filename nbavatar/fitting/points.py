@@ -85,21 +85,19 @@ class SkinnedPoints:
         points = torch.cat([share.sum(2), place[:, list(self.joints)]], 1)
         by_shape = torch.cat([by_shape, place_by_shape[:, list(self.joints)]], 1)
 
-        below = _descendants(mesh.parents)
-        columns, used = [], 0
-        generators = torch.stack([skew(axis) for axis in eye])
-        for joint in self.active:
-            under = torch.tensor(below[joint], dtype=dtype, device=device)
-            lever = torch.einsum("bpja,j->bpa", share, under) - (self.mass @ under)[:, None] * place[:, None, joint]
-            hung = (place - place[:, None, joint])[:, list(self.joints)] * under[list(self.joints), None]
-            column = -skew(torch.cat([lever, hung], 1)) @ rotation[:, None, joint]
-            if joint > 0 and correctives is not None:
-                block = correctives[..., used : used + 9]
-                turned = torch.einsum("bij,cjk->bikc", local[joint], generators).reshape(batch, 9, 3)
-                column[:, : share.shape[1]] += block @ turned[:, None]
-                used += 9
-            columns.append(column)
-        return PointBatch(points, by_shape, torch.cat(columns, -1))
+        active, hung = list(self.active), list(self.joints)
+        under = torch.tensor(_descendants(mesh.parents), dtype=dtype, device=device)[active]
+        pivot = place[:, None, active]
+        lever = torch.einsum("bpja,kj->bpka", share, under) - (self.mass @ under.mT)[..., None] * pivot
+        below = (place[:, hung, None] - pivot) * under[:, hung].mT[..., None]
+        by_turn = -skew(torch.cat([lever, below], 1)) @ rotation[:, None, active]
+        if correctives is not None:
+            bending = [i for i, joint in enumerate(active) if joint > 0]
+            generators = torch.stack([skew(axis) for axis in eye])
+            turned = torch.einsum("bkij,cjl->bkilc", turns[:, bending], generators).flatten(2, 3)
+            blocks = correctives.reshape(batch, -1, 3, len(bending), 9)
+            by_turn[:, : share.shape[1], bending] += torch.einsum("bpakf,bkfc->bpkac", blocks, turned)
+        return PointBatch(points, by_shape, by_turn.transpose(2, 3).flatten(3))
 
 
 def skinned_points(

@@ -29,6 +29,7 @@ __all__ = ["Observations", "Prior", "Step", "estimate_noise", "refine", "reproje
 
 _CHUNK = 256
 _WIDTH = 3.0
+_FREEDOM = 30.0
 _MEDIAN_2D = 1.3863  # median of a chi-square variable with two degrees of freedom
 
 
@@ -91,7 +92,7 @@ def refine(
     threshold: float,
     iterations: int,
     noise_floor: float,
-    tolerance: float = 1e-6,
+    tolerance: float = 1e-5,
     report: Callable[[Step], None] | None = None,
 ) -> tuple[State, list[Step]]:
     """Fits one part.
@@ -112,6 +113,8 @@ def refine(
         the state of the lowest cost of the last stage, and the convergence curve.
     """
     curve: list[Step] = []
+    # At first motion is all but free: what it is like is read off the first result, see `_observed_smoothness`.
+    typical, prior = prior.smoothness, dataclasses.replace(prior, smoothness=prior.smoothness / _FREEDOM**2)
     agreed = dataclasses.replace(seen, confidence=seen.confidence * seen.agree)
     schedule = [(agreed, threshold / 3, 10 * threshold), (agreed, threshold / 3, 3 * threshold)]
     left = iterations
@@ -123,6 +126,8 @@ def refine(
             current, sigma, width = schedule[stage]
         else:
             current = seen
+            if stage == len(schedule):
+                prior = dataclasses.replace(prior, smoothness=_observed_smoothness(state, typical, prior.segments))
             previous = sigma
             sigma = max(estimate_noise(part, state, seen, max(_WIDTH * previous, noise_floor)), noise_floor)
             width = _WIDTH * sigma
@@ -157,6 +162,32 @@ def _residuals(part: PartModel, state: State, seen: Observations) -> list[Tensor
         squared = ((image - seen.pixels[:, rows]) ** 2).sum(-1)
         result.append(squared[(seen.confidence[:, rows] > 0) & seen.agree[:, rows]])
     return result
+
+
+def _observed_smoothness(state: State, typical: Tensor, segments: list[tuple[int, int]]) -> Tensor:
+    """Loosens the precision of accelerations where the motion is in fact less smooth `[6 + D]`.
+
+    The keypoint loss saturates and smoothness does not: were smoothness stricter than the motion (few frames a second,
+    quick hands), it would pull meshes off their keypoints and make outliers of them.
+    """
+    found = _motion_accelerations(state, segments)
+    if not len(found):
+        return typical
+    squared = (found**2).mean(0)
+    groups = [squared[:3].mean().expand(3), squared[3:6].mean().expand(3), squared[6:]]
+    return torch.minimum(typical, 1 / torch.cat(groups).clamp_min(1e-300))
+
+
+def _motion_accelerations(state: State, segments: list[tuple[int, int]]) -> Tensor:
+    """Accelerations of rotation, translation and local `[n, 6 + D]`, of all runs one after the other."""
+    rows = []
+    for first, last in segments:
+        if last - first >= 2:
+            run = state.rows(slice(first, last + 1))
+            velocity = matrix_to_axis_angle(run.rotation[:-1].mT @ run.rotation[1:])
+            moving = accelerations(torch.cat([run.transl, run.local], 1), [(0, last - first)])[0]
+            rows.append(torch.cat([velocity[1:] - velocity[:-1], moving], 1))
+    return torch.cat(rows) if rows else state.local.new_zeros(0, 6 + state.local.shape[1])
 
 
 def _chunks(count: int) -> list[slice]:
@@ -286,11 +317,7 @@ def _add_smoothness(system: NormalEquations, state: State, prior: Prior) -> None
         if last - first < 2:
             continue
         rows = slice(first, last + 1)
-        run = state.rows(rows)
-        velocity = matrix_to_axis_angle(run.rotation[:-1].mT @ run.rotation[1:])
-        turning = velocity[1:] - velocity[:-1]
-        moving = accelerations(torch.cat([run.transl, run.local], 1), [(0, last - first)])[0]
-        residual = torch.cat([turning, moving], 1)
+        residual = _motion_accelerations(state, [(first, last)])
         weighted = residual * prior.smoothness
         system.cost += 0.5 * float((weighted * residual).sum())
         gradient = system.gradient[rows]

@@ -106,8 +106,8 @@ def _fit_part(
     model, mean = _model(name, bodies)
     seen, points = observe(extras, name, used, count, threshold=threshold, contour_weight=cfg.contour_weight)
     prior = _prior(name, model, mean, bodies, segments, cfg, count)
-    start, prior, summary = _start(name, model, extras, prior, seen, points, segments, cfg, threshold)
-    before = error_table(model, start, seen, threshold)
+    start, given, prior, summary = _start(name, model, extras, prior, seen, points, segments, cfg, threshold)
+    before = error_table(model, given, seen, threshold)
     if name != "head" and cfg.check_handedness:
         summary["handedness"] = judge_handedness(
             name, {side: HandPart(mano) for side, mano in bodies.hands.items()}, points.points, seen, prior,
@@ -157,8 +157,8 @@ def _start(
     segments: list[tuple[int, int]],
     cfg: FitConfig,
     threshold: float,
-) -> tuple[State, Prior, dict[str, Any]]:
-    """Start and prior; frames whose parameters explain less than a rigid alignment does start from the latter."""
+) -> tuple[State, State, Prior, dict[str, Any]]:
+    """Start, what was given, prior, summary; frames whose parameters explain less than a rigid alignment does start from the latter."""
     count = len(points.points)
     given = start_from_parameters(model, name, extras, count) if cfg.start != "keypoints" else None
     if given is None and cfg.start == "params":
@@ -166,7 +166,7 @@ def _start(
     if given is None:
         zero = zero_state(model, prior.local_centre[0], count)
         start, valid = start_from_keypoints(model, name, zero, points.points, segments)
-        return start, prior, {"start": "keypoints", "frames_without_points": int((~valid).sum())}
+        return start, start, prior, {"start": "keypoints", "frames_without_points": int((~valid).sum())}
     aligned, valid = start_from_keypoints(model, name, given, points.points, segments)
     wide = 10 * threshold
     worse = frame_errors(model, given, seen, wide) > 2 * frame_errors(model, aligned, seen, wide) + threshold**2
@@ -178,7 +178,9 @@ def _start(
         given.shape,
     )
     summary = {"start": "params", "frames_realigned": int(worse.sum()), "frames_without_points": int((~valid).sum())}
-    return start, with_anchor(prior, given), summary
+    # The head's deviations say nothing about the dataset's error, the hand's pose statistics say what hands do.
+    prior = with_anchor(prior, given, None if name == "head" else math.radians(cfg.anchor_deg))
+    return start, given, prior, summary
 
 
 def _model(name: str, bodies: Bodies) -> tuple[PartModel, torch.Tensor]:

@@ -1,5 +1,6 @@
 """Where a refit starts: the dataset's parameters, or a rigid alignment to triangulated keypoints."""
 
+import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
@@ -103,8 +104,19 @@ def _pivot(model: PartModel, level: State) -> Tensor:
     return torch.cat(means)
 
 
-def with_anchor(prior: Prior, state: State) -> Prior:
-    """The prior centred at a state: what keypoints do not see stays as the state has it."""
-    return Prior(
-        state.local, prior.local_root, state.shape, prior.shape_deviation, prior.smoothness, prior.segments
-    )  # fmt: skip
+def with_anchor(prior: Prior, state: State, deviation: float | None) -> Prior:
+    """Draws a prior towards a state, so that what keypoints do not see stays about as the state has it.
+
+    Args:
+        prior: belief without a state.
+        state: parameters that somebody else has fitted.
+        deviation: how far their local pose may be off [rad]: the result is the product of both beliefs. None moves
+            the centre to the state and keeps the deviations.
+    """
+    if deviation is None:
+        return dataclasses.replace(prior, local_centre=state.local, shape_centre=state.shape)
+    precision = prior.local_root.mT @ prior.local_root
+    both = precision + torch.eye(len(precision), dtype=precision.dtype) / deviation**2
+    centre = torch.linalg.solve(both, (prior.local_centre @ precision + state.local / deviation**2).mT).mT
+    root = torch.linalg.cholesky(both).mT
+    return dataclasses.replace(prior, local_centre=centre, local_root=root, shape_centre=state.shape)
