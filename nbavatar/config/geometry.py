@@ -58,8 +58,9 @@ class DeformConfig:
 
     stiffness: str = option(
         "auto",
-        "Stiffness under the skin: the user's array `stiffness.head` in the meshes [N/m^3] (data), the distance to a "
-        "skull proxy (anatomical), the same everywhere (uniform); auto takes data where there is some, else anatomical.",
+        "Stiffness under the skin: the user's array `stiffness.head` in the meshes [N/m^3] (data), from the distance to "
+        "a skull proxy (anatomical), or the same everywhere (uniform); auto takes data where there is some, else "
+        "anatomical.",
         choices=("auto", "data", "anatomical", "uniform"),
     )
     modulus: float = option(1.0e4, "Young's modulus of soft tissue [Pa].", min=0.0, max=1.0e12)

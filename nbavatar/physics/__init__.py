@@ -1,0 +1,1 @@
+"""Contact deformation of a soft head by rigid hands."""

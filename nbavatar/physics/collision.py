@@ -1,0 +1,176 @@
+"""Where hands and head touch or overlap, as contacts for the solver and as figures for the report."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from nbavatar.mesh.bvh import DeformingMesh, surface_points
+
+__all__ = ["Contacts", "Overlap", "find_contacts", "measure_overlap", "outside_free"]
+
+# Steps by which the way out of a hand is searched along the inward normal [m].
+_MARCH = np.arange(1, 17) * 0.002
+
+
+class Contacts(NamedTuple):
+    """C points of hands against points of the head's surface.
+
+    Attributes:
+        points: hand points [m], (C, 3).
+        normals: unit vectors from the head to the hand, (C, 3).
+        ids: head vertices, (C, 3); `weights` their barycentric weights (C, 3).
+        hand: index of the hand, (C,).
+        anchor: hand vertices that the point is made of, (C, 3); `anchor_weights` (C, 3).
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    ids: np.ndarray
+    weights: np.ndarray
+    hand: np.ndarray
+    anchor: np.ndarray
+    anchor_weights: np.ndarray
+
+
+class Overlap(NamedTuple):
+    """How far two meshes are inside each other.
+
+    Attributes:
+        hand_depth: depth of hand vertices inside the head [m], (Vh,), 0 outside.
+        head_depth: depth of head vertices inside the hand [m], (V,), 0 outside.
+        hand_distance: unsigned distance of hand vertices to the head [m], (Vh,), inf beyond the search radius.
+        head_distance: the same of head vertices to the hand, (V,).
+    """
+
+    hand_depth: np.ndarray
+    head_depth: np.ndarray
+    hand_distance: np.ndarray
+    head_distance: np.ndarray
+
+    @property
+    def deepest(self) -> float:
+        """Greatest depth of any vertex [m]."""
+        return float(max(self.hand_depth.max(initial=0.0), self.head_depth.max(initial=0.0)))
+
+
+def outside_free(head: DeformingMesh, hand: DeformingMesh, distance: float) -> bool:
+    """True if the bounding boxes alone show that nothing is nearer than `distance` [m]."""
+    (a, b), (c, d) = head.box(), hand.box()
+    return bool((c > b + distance).any() or (d < a - distance).any())
+
+
+def measure_overlap(head: DeformingMesh, hand: DeformingMesh, count: tuple[int, int], radius: float) -> Overlap:
+    """Distances within a radius, and depths at any depth.
+
+    Args:
+        head: the head; `hand`: one hand.
+        count: numbers of vertices of head and hand (the meshes also hold the hubs of closed holes).
+        radius: how far outside distances are wanted [m].
+    """
+    hand_depth, hand_distance = _depths(head, hand.verts[: count[1]], radius)
+    head_depth, head_distance = np.zeros(count[0]), np.full(count[0], np.inf)
+    low, high = hand.box()
+    points = head.verts[: count[0]]
+    near = np.flatnonzero(((points >= low - radius) & (points <= high + radius)).all(axis=1))
+    if len(near):
+        head_depth[near], head_distance[near] = _depths(hand, np.ascontiguousarray(points[near]), radius)
+    return Overlap(hand_depth, head_depth, hand_distance, head_distance)
+
+
+def _depths(mesh: DeformingMesh, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    distance, face, _ = mesh.closest(points, radius)
+    inside = mesh.inside(points)
+    deep = np.flatnonzero(inside & (face < 0))
+    if len(deep):
+        distance[deep] = mesh.closest(points[deep], np.inf)[0]
+    return np.where(inside, distance, 0.0), distance
+
+
+def find_contacts(
+    head: DeformingMesh,
+    hands: list[DeformingMesh],
+    hand_counts: list[int],
+    outward: np.ndarray,
+    movable: np.ndarray,
+    radius: float,
+    near: float,
+) -> Contacts:
+    """Contacts of all hands with the head, both ways: hand vertices against head faces, head vertices against hands.
+
+    The normal is the direction of the shortest way apart. Where that way would pull the skin outwards (a fingertip that came
+    out on the far side, a vertex behind the finger) it is the head's smoothed outward normal instead.
+
+    Args:
+        head: deformed head; `hands`: one mesh each, `hand_counts` their vertex numbers.
+        outward: smoothed unit normals of the head's rest shape, (V, 3).
+        movable: head vertices that may be in a contact of the second kind, (A,).
+        radius: how deep a contact is looked for [m].
+        near: points outside by less than this are contacts too, so that they do not enter later [m].
+    """
+    parts: list[tuple[np.ndarray, ...]] = []
+    for h, (hand, count) in enumerate(zip(hands, hand_counts, strict=True)):
+        points = hand.verts[:count]
+        distance, face, weight = head.closest(points, radius)
+        found = np.flatnonzero(face >= 0)
+        if len(found):
+            inside = head.inside(points[found])
+            keep = inside | (distance[found] < near)
+            found, inside = found[keep], inside[keep]
+        if len(found):
+            face, weight, p = face[found], weight[found], points[found]
+            q = surface_points(head.verts, head.faces, face, weight)
+            ids = head.faces[face]
+            away = _unit(np.einsum("pc,pci->pi", weight, outward[ids]))
+            normal = _direction(p, q, distance[found], inside, away)
+            wrong = (normal * away).sum(1) < 0.2
+            normal[wrong] = away[wrong]
+            one = np.tile([1.0, 0.0, 0.0], (len(found), 1))
+            parts.append((p, normal, ids, weight, np.full(len(found), h), np.repeat(found[:, None], 3, 1), one))
+        low, high = hand.box()
+        x = head.verts[movable]
+        boxed = movable[((x >= low - near) & (x <= high + near)).all(axis=1)]
+        if not len(boxed):
+            continue
+        x = head.verts[boxed]
+        distance, face, weight = hand.closest(x, radius)
+        found = np.flatnonzero(face >= 0)
+        if not len(found):
+            continue
+        inside = hand.inside(x[found])
+        keep = inside | (distance[found] < near)
+        found, inside = found[keep], inside[keep]
+        if not len(found):
+            continue
+        v, x, face, weight = boxed[found], x[found], face[found], weight[found]
+        q = surface_points(hand.verts, hand.faces, face, weight)
+        # From hand to head is the direction out of the hand; the contact's normal is its opposite.
+        normal = -_direction(x, q, distance[found], inside, -outward[v])
+        wrong = (normal * outward[v]).sum(1) < -0.2
+        for k in np.flatnonzero(wrong):
+            normal[k] = outward[v[k]]
+            if inside[k]:
+                path = x[k] - _MARCH[:, None] * outward[v[k]]
+                out = np.flatnonzero(~hand.inside(path))
+                q[k] = path[out[0]] if len(out) else path[-1]
+        keep = ~wrong | inside
+        one = np.tile([1.0, 0.0, 0.0], (int(keep.sum()), 1))
+        ids = np.repeat(v[keep][:, None], 3, axis=1)
+        # Head vertices use one weight; the other two entries name the same vertex with weight 0.
+        parts.append((q[keep], normal[keep], ids, one, np.full(len(ids), h), hand.faces[face[keep]], weight[keep]))
+    if not parts:
+        none = np.zeros((0, 3))
+        no_ids = np.zeros((0, 3), np.int64)
+        return Contacts(none, none, no_ids, none, np.zeros(0, np.int64), no_ids, none)
+    return Contacts(*(np.ascontiguousarray(np.concatenate(column)) for column in zip(*parts, strict=True)))
+
+
+def _direction(
+    points: np.ndarray, nearest: np.ndarray, distance: np.ndarray, inside: np.ndarray, otherwise: np.ndarray
+) -> np.ndarray:
+    """Unit vectors out of a surface at `nearest`, from points on either side of it."""
+    way = np.where(inside[:, None], nearest - points, points - nearest)
+    return np.where((distance > 1e-6)[:, None], way / np.maximum(distance, 1e-12)[:, None], otherwise)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)

@@ -1,0 +1,372 @@
+"""One frame of contact: how a soft head gives way to hands, and how far tracked hands are moved back.
+
+The head's shape without contact and the tracked hands come in; out come the deformed head and hands with a small
+rigid correction, so that no vertex of one is inside the other. The hand follows a path: from its place in the frame
+before (or, where there is none, from where it does not touch) to its place now, in steps of a few millimetres, and
+the skin is pushed ahead of it. So a fast finger does not pass through a cheek, and a hand that starts deep inside is
+resolved on the side it came from.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from nbavatar.mesh.bvh import DeformingMesh
+from nbavatar.mesh.drawing import vertex_normals
+from nbavatar.physics.collision import Contacts, find_contacts, measure_overlap, outside_free
+from nbavatar.physics.tissue import SoftSurface
+from nbavatar.physics.xpbd import relax
+
+__all__ = ["ContactNumbers", "ContactSolver", "FrameResult", "rigid_motion"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactNumbers:
+    """Numbers of the contact model; units in [brackets]."""
+
+    stretch: float = 30.0  # of an edge [N/m]
+    shear: float = 300.0  # of the layer of fat, by which neighbours move along [N/m]
+    bending: float = 1e-5  # flexural rigidity of the skin [N m]
+    volume: float = 0.0  # resistance to loss of volume [N/m^5]
+    friction: float = 0.3
+    density: float = 10.0  # of moving tissue, per area [kg/m^2]
+    reach: float = 0.05  # how far from a contact the skin moves, along the surface [m]
+    max_dent: float = 0.035  # [m]
+    hand_mass: float = 0.4  # [kg]
+    hand_stiffness: float = 1e4  # of the track's hold on the hand's position [N/m]
+    hand_turn_stiffness: float = 10.0  # [N m]
+    hand_shift: float = 0.004  # bound of the correction [m]
+    hand_turn: float = 0.05  # bound of the correction [rad]
+    touch: float = 0.002  # nearer than this is contact [m]
+    tolerance: float = 1e-4  # depth left at most [m]
+    step: float = 0.003  # longest step of the hand's path [m]
+    max_steps: int = 16
+    settle: int = 4  # steps at the end of the path
+    iterations: int = 8  # per step
+    time_step: float = 0.002  # [s]
+    repair: int = 40  # rounds of the final projection
+
+
+class FrameResult(NamedTuple):
+    """Outcome of one frame.
+
+    Attributes:
+        head: deformed head [m], (V, 3) float64; `hands`: corrected hands.
+        pose: correction of each hand, translation [m] and rotation vector [rad] about the hand's centroid, (H, 6).
+        head_contact: head vertices nearer to a hand than the touch distance, (V,) bool; `hand_contact` likewise.
+        depth: greatest depth before and after [m]. steps: steps taken.
+        exceeded: the depth left is over the tolerance, or a bound (dent, hand correction) was reached.
+        active: number of simulated head vertices; 0 where nothing was to be done and the input is returned as it was.
+    """
+
+    head: np.ndarray
+    hands: list[np.ndarray]
+    pose: np.ndarray
+    head_contact: np.ndarray
+    hand_contact: list[np.ndarray]
+    depth: tuple[float, float]
+    steps: int
+    exceeded: bool
+    active: int
+
+
+class ContactSolver:
+    """Contact of one head with its hands; holds what does not change from frame to frame."""
+
+    def __init__(
+        self,
+        surface: SoftSurface,
+        head_rest: np.ndarray,
+        hands: list[tuple[np.ndarray, np.ndarray]],
+        numbers: ContactNumbers,
+        pinned: np.ndarray | None = None,
+    ) -> None:
+        """Builds hierarchies and masses.
+
+        Args:
+            surface: operators of the head.
+            head_rest: rest shape [m], (V, 3).
+            hands: rest shape (Vh, 3) [m] and faces (Fh, 3) of each hand.
+            numbers: the model's numbers.
+            pinned: ids of head vertices that never move, such as the neck's rim.
+        """
+        self.surface, self.numbers = surface, numbers
+        self._head = DeformingMesh(head_rest, surface.faces)
+        self._hands = [DeformingMesh(rest, faces) for rest, faces in hands]
+        self._count, self._hand_counts = len(head_rest), [len(rest) for rest, _ in hands]
+        mass = numbers.density * surface.area
+        self._inverse_mass = 1.0 / mass
+        if pinned is not None:
+            self._inverse_mass[pinned] = 0.0
+        self._support = surface.bed * surface.area
+        self._bend = numbers.bending * surface.area
+        a, b = surface.edges.T
+        length = np.maximum(np.linalg.norm(head_rest[a] - head_rest[b], axis=1), 1e-9)
+        self._graph = scipy.sparse.csr_matrix((length, (a, b)), shape=(self._count,) * 2)
+        self._smoother = _smoother(surface)
+        inertia = numbers.hand_mass * 0.05**2
+        self._pose_inverse_mass = np.tile([1.0 / numbers.hand_mass, 1.0 / inertia], (len(hands), 1))
+
+    def solve(self, head: np.ndarray, hands: list[np.ndarray], before: FrameResult | None = None,
+              head_before: np.ndarray | None = None, hands_before: list[np.ndarray] | None = None) -> FrameResult:  # fmt: skip
+        """Resolves the contact of one frame.
+
+        Args:
+            head: head without contact [m], (V, 3). hands: tracked hands, (Vh, 3) each. All finite.
+            before: result of the preceding frame, if it belongs to the same uncut run; `head_before`, `hands_before` are
+                its inputs.
+        """
+        n = self.numbers
+        head = np.ascontiguousarray(head, np.float64)
+        hands = [np.ascontiguousarray(hand, np.float64) for hand in hands]
+        depth, free = self._probe(head, hands)
+        if free is not None:
+            return free
+        outward = self._outward(head)
+        dent, pose, start = self._begin(head, hands, outward, before, head_before, hands_before)
+        centre = np.array([hand.mean(axis=0) for hand in hands])
+        travel = max(float(np.linalg.norm(a - b, axis=1).max()) for a, b in zip(hands, start, strict=True))
+        path = int(np.clip(math.ceil(travel / n.step), 1, n.max_steps))
+        x = head + dent
+        touched = np.zeros(self._count, bool)
+        active = np.zeros(0, np.int64)
+        last = [self._posed(s, pose[k], centre[k]) for k, s in enumerate(start)]
+        total = path + n.settle
+        done = 0
+        for step in range(1, total + 1):
+            share = min(step / path, 1.0)
+            there = [s + share * (hand - s) for s, hand in zip(start, hands, strict=True)]
+            now = [self._posed(p, pose[k], centre[k]) for k, p in enumerate(there)]
+            contacts = self._contacts(x, now, outward, active)
+            hit = np.unique(contacts.ids)
+            if len(hit) and not touched[hit].all():
+                touched[hit] = True
+                active = self._active(touched | (np.linalg.norm(dent, axis=1) > 1e-5))
+                local = self._local(active, head)
+            if not len(active):
+                last = now
+                continue
+            previous = np.einsum("pc,pci->pi", contacts.anchor_weights, _gather(last, contacts))
+            self._relax(x, head, local, contacts, previous, pose, centre, n.iterations)
+            last = now
+            done += 1
+        final = [self._posed(hand, pose[k], centre[k]) for k, hand in enumerate(hands)]
+        self._repair(x, head, final, outward, active)
+        return self._result(x, head, final, pose, depth, done, len(active))
+
+    def _probe(self, head: np.ndarray, hands: list[np.ndarray]) -> tuple[float, FrameResult | None]:
+        """Depth before, and the result if there is nothing to do."""
+        n = self.numbers
+        self._head.move(head)
+        deepest, head_contact, hand_contact = 0.0, np.zeros(self._count, bool), []
+        for mesh, hand, count in zip(self._hands, hands, self._hand_counts, strict=True):
+            mesh.move(hand)
+            if outside_free(self._head, mesh, n.touch):
+                hand_contact.append(np.zeros(count, bool))
+                continue
+            overlap = measure_overlap(self._head, mesh, (self._count, count), n.touch)
+            deepest = max(deepest, overlap.deepest)
+            head_contact |= overlap.head_distance < n.touch
+            hand_contact.append(overlap.hand_distance < n.touch)
+        if deepest > n.tolerance:
+            return deepest, None
+        pose = np.zeros((len(hands), 6))
+        return deepest, FrameResult(head, hands, pose, head_contact, hand_contact, (deepest, deepest), 0, False, 0)
+
+    def _begin(
+        self, head: np.ndarray, hands: list[np.ndarray], outward: np.ndarray, before: FrameResult | None,
+        head_before: np.ndarray | None, hands_before: list[np.ndarray] | None,
+    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:  # fmt: skip
+        """Dent, hand corrections and start of the hands' path, from the frame before or from outside."""
+        n = self.numbers
+        if before is not None and head_before is not None and hands_before is not None:
+            rotation, shift = rigid_motion(head_before, head)
+            start = [hand @ rotation.T + shift for hand in hands_before]
+            travel = max(float(np.linalg.norm(a - b, axis=1).max()) for a, b in zip(hands, start, strict=True))
+            if travel <= n.step * n.max_steps:
+                dent = (before.head - head_before) @ rotation.T
+                pose = np.concatenate([p.reshape(-1, 3) @ rotation.T for p in before.pose]).reshape(-1, 6)
+                centre = [hand.mean(axis=0) for hand in hands]
+                posed = [self._posed(s, pose[k], centre[k]) for k, s in enumerate(start)]
+                if self._deepest(head + dent, posed) < 2.0 * n.step:
+                    return dent, pose, start
+        pose = np.zeros((len(hands), 6))
+        return np.zeros_like(head), pose, [self._retreat(head, k, hand, outward) for k, hand in enumerate(hands)]
+
+    def _retreat(self, head: np.ndarray, k: int, hand: np.ndarray, outward: np.ndarray) -> np.ndarray:
+        """The hand moved out along the skin's mean normal until it is out of the head."""
+        n = self.numbers
+        self._head.move(head)
+        mesh, count = self._hands[k], self._hand_counts[k]
+        mesh.move(hand)
+        inside = np.flatnonzero(self._head.inside(np.ascontiguousarray(mesh.verts[:count])))
+        if not len(inside):
+            return hand
+        _, face, weight = self._head.closest(np.ascontiguousarray(hand[inside]), np.inf)
+        away = np.einsum("pc,pci->i", weight, outward[self._head.faces[face]])
+        away /= max(float(np.linalg.norm(away)), 1e-12)
+        out = hand
+        for _ in range(24):
+            points = np.ascontiguousarray(out[inside])
+            still = self._head.inside(points)
+            if not still.any():
+                inside = np.flatnonzero(self._head.inside(np.ascontiguousarray(out)))
+                if not len(inside):
+                    break
+                continue
+            depth = self._head.closest(np.ascontiguousarray(points[still]), np.inf)[0].max()
+            out = out + away * max(1.05 * float(depth), 0.001)
+        return out
+
+    def _contacts(
+        self, x: np.ndarray, hands: list[np.ndarray], outward: np.ndarray, active: np.ndarray, near: float | None = None
+    ) -> Contacts:
+        n = self.numbers
+        self._head.move(x)
+        for mesh, hand in zip(self._hands, hands, strict=True):
+            mesh.move(hand)
+        movable = active if len(active) else np.arange(self._count)
+        near = 0.5 * n.step if near is None else near
+        return find_contacts(self._head, self._hands, self._hand_counts, outward, movable, 4.0 * n.step, near)
+
+    def _deepest(self, x: np.ndarray, hands: list[np.ndarray]) -> float:
+        self._head.move(x)
+        deepest = 0.0
+        for mesh, hand, count in zip(self._hands, hands, self._hand_counts, strict=True):
+            mesh.move(hand)
+            if not outside_free(self._head, mesh, 0.0):
+                deepest = max(deepest, measure_overlap(self._head, mesh, (self._count, count), 1e-3).deepest)
+        return deepest
+
+    def _active(self, touched: np.ndarray) -> np.ndarray:
+        """Vertices within reach of what is touched, along the surface."""
+        distance = scipy.sparse.csgraph.dijkstra(
+            self._graph, directed=False, indices=np.flatnonzero(touched), limit=self.numbers.reach, min_only=True
+        )
+        return np.flatnonzero(np.isfinite(distance))
+
+    def _local(self, active: np.ndarray, head: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Active ids, inverse masses (0 elsewhere), edges with their rest lengths, faces, bulge."""
+        moving = np.zeros(self._count, bool)
+        moving[active] = True
+        inverse_mass = np.where(moving, self._inverse_mass, 0.0)
+        pairs = self.surface.edges[moving[self.surface.edges].any(axis=1)]
+        lengths = np.linalg.norm(head[pairs[:, 0]] - head[pairs[:, 1]], axis=1)
+        faces = self.surface.faces[moving[self.surface.faces].all(axis=1)]
+        return active, inverse_mass, pairs, lengths, faces, moving.astype(np.float64)
+
+    def _relax(
+        self, x: np.ndarray, head: np.ndarray, local: tuple[np.ndarray, ...], contacts: Contacts, previous: np.ndarray,
+        pose: np.ndarray, centre: np.ndarray, iterations: int,
+    ) -> None:  # fmt: skip
+        n, s = self.numbers, self.surface
+        active, inverse_mass, pairs, lengths, faces, bulge = local
+        table = np.concatenate((contacts.points, previous, contacts.normals), axis=1)
+        relax(
+            x, head, inverse_mass, active, self._support, pairs, lengths, n.stretch, n.shear, s.ring, s.ring_ids, s.ring_weights,
+            self._bend, faces, bulge, n.volume, table, contacts.ids, contacts.weights, contacts.hand, pose,
+            self._pose_inverse_mass, np.array([n.hand_stiffness, n.hand_turn_stiffness]),
+            np.array([n.hand_shift, n.hand_turn]), centre, n.time_step, iterations, n.friction, n.max_dent,
+        )  # fmt: skip
+
+    def _repair(
+        self, x: np.ndarray, head: np.ndarray, hands: list[np.ndarray], outward: np.ndarray, active: np.ndarray
+    ) -> None:
+        """Pushes out what is still inside, with the hands held: the guarantee that the step sizes cannot give."""
+        n, s = self.numbers, self.surface
+        if not len(active):
+            return
+        moving = np.zeros(self._count)
+        moving[active] = 1.0
+        moving = np.where(self._inverse_mass > 0, moving, 0.0)
+        none, no_faces = np.zeros((0, 2), np.int64), np.zeros((0, 3), np.int64)
+        held, still = np.zeros((len(hands), 6)), np.zeros((len(hands), 2))
+        for _ in range(n.repair):
+            if self._deepest(x, hands) <= 0.5 * n.tolerance:
+                break
+            contacts = self._contacts(x, hands, outward, active, near=2e-4)
+            table = np.concatenate((contacts.points, contacts.points, contacts.normals), axis=1)
+            # Aim a little outside, so that rounding and neighbours do not undo it.
+            table[:, :3] -= 0.2 * n.tolerance * contacts.normals
+            relax(
+                x, head, moving, active, np.zeros(self._count), none, np.zeros(0), 0.0, 0.0, s.ring, s.ring_ids,
+                s.ring_weights, np.zeros(self._count), no_faces, moving, 0.0, table, contacts.ids, contacts.weights,
+                contacts.hand, held, still, np.zeros(2), np.full(2, np.inf), np.zeros((len(hands), 3)), 1.0, 4, 0.0,
+                n.max_dent,
+            )  # fmt: skip
+
+    def _result(
+        self, x: np.ndarray, head: np.ndarray, hands: list[np.ndarray], pose: np.ndarray, depth: float, steps: int, active: int
+    ) -> FrameResult:  # fmt: skip
+        n = self.numbers
+        self._head.move(x)
+        deepest, head_contact, hand_contact = 0.0, np.zeros(self._count, bool), []
+        for mesh, hand, count in zip(self._hands, hands, self._hand_counts, strict=True):
+            mesh.move(hand)
+            overlap = measure_overlap(self._head, mesh, (self._count, count), n.touch)
+            deepest = max(deepest, overlap.deepest)
+            head_contact |= overlap.head_distance < n.touch
+            hand_contact.append(overlap.hand_distance < n.touch)
+        dent = float(np.linalg.norm(x - head, axis=1).max())
+        shift = np.linalg.norm(pose[:, :3], axis=1).max()
+        turn = np.linalg.norm(pose[:, 3:], axis=1).max()
+        exceeded = (
+            deepest > 2.0 * n.tolerance
+            or dent >= 0.999 * n.max_dent
+            or shift >= 0.999 * n.hand_shift > 0
+            or turn >= 0.999 * n.hand_turn > 0
+        )
+        return FrameResult(x, hands, pose, head_contact, hand_contact, (depth, deepest), steps, bool(exceeded), active)
+
+    def _outward(self, head: np.ndarray) -> np.ndarray:
+        """Outward normals of the rest shape, smoothed so that nostrils and lips do not turn them."""
+        normals = vertex_normals(head, self.surface.faces)
+        for _ in range(4):
+            normals = self._smoother @ normals
+        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+    @staticmethod
+    def _posed(hand: np.ndarray, pose: np.ndarray, centre: np.ndarray) -> np.ndarray:
+        if not pose.any():
+            return hand
+        return (hand - centre) @ _rotation(pose[3:]).T + centre + pose[:3]
+
+
+def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least-squares rotation (3, 3) and translation (3,) [m] that take points (V, 3) to points (V, 3) (Kabsch 1976)."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return rotation, b - rotation @ a
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a rotation vector [rad] (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def _gather(hands: list[np.ndarray], contacts: Contacts) -> np.ndarray:
+    """Positions (C, 3, 3) of the hand vertices that contacts are made of."""
+    out = np.zeros((len(contacts.hand), 3, 3))
+    for h, hand in enumerate(hands):
+        mine = contacts.hand == h
+        out[mine] = hand[contacts.anchor[mine]]
+    return out
+
+
+def _smoother(surface: SoftSurface) -> scipy.sparse.csr_matrix:
+    """Row-stochastic average over neighbours and self."""
+    count = len(surface.area)
+    a, b = surface.edges.T
+    matrix = scipy.sparse.coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count))
+    matrix = (matrix + matrix.T + scipy.sparse.eye(count)).tocsr()
+    return scipy.sparse.csr_matrix(scipy.sparse.diags(1.0 / np.asarray(matrix.sum(axis=1)).ravel()) @ matrix)
