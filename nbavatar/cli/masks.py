@@ -29,6 +29,7 @@ from nbavatar.data.sequences import read_sequence
 from nbavatar.data.sources import LAYERS
 from nbavatar.data.supplied_masks import supplied_masks
 from nbavatar.errors import DataError
+from nbavatar.image.clothes import ClothesModel
 from nbavatar.io.framepack import FramePack, FramePackWriter
 from nbavatar.provenance import run_record
 
@@ -68,7 +69,10 @@ def main(args: argparse.Namespace) -> None:
         record = run_record("masks", config=to_mapping(cfg), inputs=inputs, extra=extra)
         layers = {name: LAYERS[name] for name in ("label", "alpha")}
         with FramePackWriter(args.out, {**manifest, "stage": "masks", "layers": layers, "record": record}) as out:
-            cut = cut_masks(masks, cutter, runs, numbers, statistics)
+            model = ClothesModel(cfg.clothes_evidence) if cfg.clothes and "rgb" in pack.layers else None
+            cut = cut_masks(
+                masks, cutter, runs, numbers, statistics, images=lambda frame: pack.read("rgb", frame), clothes=model
+            )
             for frame, label, alpha in progress(cut, f"masks {manifest['subject']}/{camera.name}", len(frames)):
                 out.add("label", frame, label)
                 out.add("alpha", frame, alpha)

@@ -64,6 +64,10 @@ class MasksConfig:
     forearm_length: float = option(
         0.12, "Length of the stretch beyond the wrist that is cut from the head [m].", min=0.0
     )
+    clothes: bool = option(True, "Tell collars from necks by colour (mattes only) and leave them out.")
+    clothes_evidence: float = option(
+        1.0, "How much likelier cloth has to be than head, as a natural logarithm [1].", min=0.0
+    )
     hole_fraction: float = option(0.002, "Holes smaller than this share of the part are filled [1].", min=0.0, max=1.0)
     island_fraction: float = option(
         0.02, "Islands smaller than this share of the part are removed [1].", min=0.0, max=1.0

@@ -1,13 +1,14 @@
 """From mattes and meshes to the label and coverage of every frame of one camera, three frames in memory at a time."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import cv2
 import numpy as np
 
 from nbavatar.data.part_masks import PartCutter
 from nbavatar.image.clean import clean_labels, repair_flicker
+from nbavatar.image.clothes import ClothesModel
 
 __all__ = ["MaskNumbers", "MaskStatistics", "cut_masks"]
 
@@ -29,6 +30,7 @@ class MaskStatistics:
 
     labelled: int = 0
     dropped: int = 0
+    clothes: int = 0
     removed: int = 0
     filled: int = 0
     flicker: int = 0
@@ -50,6 +52,9 @@ def cut_masks(
     runs: Sequence[Sequence[str]],
     numbers: MaskNumbers,
     statistics: MaskStatistics,
+    *,
+    images: Callable[[str], np.ndarray] | None = None,
+    clothes: ClothesModel | None = None,
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yields (frame, label uint8 `[H, W]`, alpha uint8 `[H, W]`) in the order of `masks`.
 
@@ -60,11 +65,14 @@ def cut_masks(
         runs: frames of each uncut run; flicker is not repaired across cuts.
         numbers: thresholds.
         statistics: filled in on the way.
+        images: reads the colour image of a frame, for `clothes`.
+        clothes: removes cloth from the neck of mattes; None leaves it there.
     """
     run_of: Mapping[str, int] = {frame: number for number, run in enumerate(runs) for frame in run}
     window: list[_Frame] = []
     for name, mask, coverage in masks:
-        window.append(_prepare(name, mask, coverage, cutter, numbers, statistics))
+        colours = images if clothes is not None else None
+        window.append(_prepare(name, mask, coverage, cutter, numbers, statistics, colours, clothes))
         if len(window) == 3:
             yield _finish(window[0], window[1], window[2], run_of, numbers, statistics)
             window.pop(0)
@@ -83,10 +91,19 @@ def _prepare(
     cutter: PartCutter,
     numbers: MaskNumbers,
     statistics: MaskStatistics,
+    images: Callable[[str], np.ndarray] | None,
+    clothes: ClothesModel | None,
 ) -> _Frame:
     outlines = cutter.silhouettes(name)
     if mask.max(initial=0) > 3:
         label = cutter.cut(mask, outlines, numbers.threshold)
+        if images is not None and clothes is not None:
+            image, person = images(name), mask > numbers.threshold
+            clothes.learn(image, outlines.face & person, outlines.torso & person)
+            cloth = clothes.cloth(image, outlines.neck & (label == 1))
+            statistics.clothes += int(cloth.sum())
+            label[cloth] = 0
+            outlines.support[cloth] = 0
         statistics.dropped += int(((mask > numbers.threshold) & (label == 0)).sum())
     else:
         label = mask

@@ -14,7 +14,6 @@ beyond the sleeve's length counts as head.
 """
 
 import dataclasses
-from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -33,6 +32,8 @@ _RINGS = 5
 _COLLAR_LENGTH = 0.25  # [m]
 _COLLAR_FLARE = 1.2  # radius gained per length
 _SLEEVE_FLARE = 0.12
+_SCALP = (0.2, 0.6)  # heights, border 0 and centroid 1, between which the margin widens from the neck's to the hair's
+_CLOTHES = 0.5  # height below which clothes may cover the head's mesh
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,10 +53,21 @@ class Silhouettes:
     Attributes:
         support: uint8 `[H, W]`, part that is in front, 0 where there is none or a sleeve hides it.
         nearest: uint8 `[H, W]`, part whose surface is nearest and within its margin, 0 where there is none.
+        rim: float32 `[H, W]`, how far from the matte's edge such a pixel may be [px]: infinite on the surfaces
+        themselves
+            and around the scalp; elsewhere the margin, because what stands off a neck or a hand ends soon after it,
+            while a torso behind them does not.
+        face: bool `[H, W]`, upper head, where no clothes are.
+        neck: bool `[H, W]`, lower head and all around the surfaces, where clothes may be.
+        torso: bool `[H, W]`, nearest to the collar: torso, if the matte has anything there.
     """
 
     support: np.ndarray
     nearest: np.ndarray
+    rim: np.ndarray
+    face: np.ndarray
+    neck: np.ndarray
+    torso: np.ndarray
 
 
 class PartCutter:
@@ -72,15 +84,17 @@ class PartCutter:
         corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], dtype=np.float64)
         self._reach = float(np.linalg.norm((corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], axis=1).max() * 1.1)
         self._borders: dict[str, np.ndarray] = {}
-        faces, owners, reaches, solid = [], [], [], []
+        faces, owners, reaches, solid, heights = [], [], [], [], []
         offset = 0
         for name, part in sequence.parts.items():
             hair = margins.hair if name == "head" else 0.0
+            height = _heights(part.rest, part.faces, border := _border(part.rest, part.faces))
+            heights.append(height if name == "head" else np.full(len(part.faces), np.nan))
             narrow = margins.neck if name == "head" else margins.hand
-            border = _border(part.rest, part.faces)
             faces.append(part.faces + offset)
             owners.append(np.full(len(part.faces), LABELS[name], dtype=np.uint8))
-            reaches.append(np.maximum(_scalp(part.rest, part.faces, border) * hair, narrow))
+            scalp = hair * np.clip((height - _SCALP[0]) / (_SCALP[1] - _SCALP[0]), 0.0, 1.0)
+            reaches.append(np.maximum(scalp, narrow))
             solid.append(np.ones(len(part.faces), dtype=bool))
             offset += len(part.rest)
             if border is not None and (name == "head" or margins.sleeve > 0):
@@ -89,10 +103,12 @@ class PartCutter:
                 faces.append(strips)
                 owners.append(np.zeros(len(strips), dtype=np.uint8))
                 reaches.append(np.zeros(len(strips)))
+                heights.append(np.full(len(strips), -1.0 if name == "head" else np.nan))
                 solid.append(np.full(len(strips), name != "head"))
                 offset += len(border) * _RINGS
         self._faces, self._solid = np.concatenate(faces), np.concatenate(solid)
         self._owner, self._margin = np.concatenate(owners), np.concatenate(reaches).astype(np.float32)
+        self._height, self._narrow = np.concatenate(heights), max(margins.neck, margins.hand)
         self._lengths = {name: _COLLAR_LENGTH if name == "head" else margins.sleeve for name in self._borders}
 
     def silhouettes(self, frame: str) -> Silhouettes:
@@ -118,27 +134,29 @@ class PartCutter:
             face, depth = np.where(fill, soft[behind], face), np.where(fill, far, depth)
         support = np.where(face >= 0, self._owner[face], np.uint8(0))
         if not (face >= 0).any():
-            return Silhouettes(support, support)
+            nowhere = np.zeros(face.shape, dtype=bool)
+            return Silhouettes(support, support, np.zeros(face.shape, np.float32), nowhere, nowhere, nowhere)
         distance, index = _nearest(face >= 0)
-        focal = float(self._camera.K[0, 0])
-        near_face, near_depth = face.reshape(-1)[index], depth.reshape(-1)[index]
-        within = distance * near_depth / focal <= self._margin[near_face]
-        nearest = np.where((face >= 0) | within, self._owner[near_face], np.uint8(0))
-        return Silhouettes(support, nearest)
+        near_face = face.reshape(-1)[index]
+        pixels = (float(self._camera.K[0, 0]) / depth.reshape(-1)[index] * self._margin[near_face]).astype(np.float32)
+        within = (face >= 0) | (distance <= pixels)
+        wide = (face >= 0) | (self._margin[near_face] > self._narrow)
+        height = self._height[near_face]
+        on_head = support == LABELS["head"]
+        return Silhouettes(
+            support,
+            np.where(within, self._owner[near_face], np.uint8(0)),
+            np.where(wide, np.float32(np.inf), pixels),
+            on_head & (height > _CLOTHES),
+            (on_head & (height <= _CLOTHES)) | (face < 0),
+            height < 0,
+        )
 
     def cut(self, matte: np.ndarray, silhouettes: Silhouettes, threshold: int) -> np.ndarray:
         """Labels uint8 `[H, W]` of the foreground of one grey matte, not yet cleaned."""
-        return np.where(threshold_matte(matte, threshold), silhouettes.nearest, np.uint8(0))
-
-
-def merge_labels(images: Mapping[str, np.ndarray]) -> np.ndarray:
-    """One label image from bool masks by part name; where masks overlap the later part of `PARTS` wins."""
-    shape = next(iter(images.values())).shape
-    label = np.zeros(shape, dtype=np.uint8)
-    for name in PARTS:
-        if name in images:
-            label[images[name]] = LABELS[name]
-    return label
+        person = threshold_matte(matte, threshold)
+        inside = cv2.distanceTransform(person.astype(np.uint8), cv2.DIST_L2, 5)
+        return np.where(person & (inside <= silhouettes.rim), silhouettes.nearest, np.uint8(0))
 
 
 def _border(rest: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
@@ -150,17 +168,16 @@ def _border(rest: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     return np.asarray(loops[int(np.argmax(lengths))])
 
 
-def _scalp(rest: np.ndarray, faces: np.ndarray, border: np.ndarray | None) -> np.ndarray:
-    """How much of the hair's margin each face gets, 0 at the open border to 1 at the far half of the part.
+def _heights(rest: np.ndarray, faces: np.ndarray, border: np.ndarray | None) -> np.ndarray:
+    """Height of each face along the axis from the open border (0) to the part's centroid (1); 1 without a border.
 
-    Height is measured along the axis from the border to the centroid, so no knowledge of the topology is used.
+    No knowledge of the topology is used.
     """
-    centres = rest[faces].mean(axis=1)
     if border is None:
         return np.ones(len(faces))
     axis = rest.mean(axis=0) - rest[border].mean(axis=0)
-    heights = (centres - rest[border].mean(axis=0)) @ axis / max(float(axis @ axis), 1e-12)
-    return np.clip((heights - 0.5) / 0.5, 0.0, 1.0)
+    heights = (rest[faces].mean(axis=1) - rest[border].mean(axis=0)) @ axis / max(float(axis @ axis), 1e-12)
+    return np.maximum(heights, 0.0)
 
 
 def _extrude(verts: np.ndarray, border: np.ndarray, length: float, flare: float) -> np.ndarray:

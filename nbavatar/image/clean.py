@@ -61,8 +61,9 @@ def clean_labels(label: np.ndarray, support: np.ndarray, *, hole_fraction: float
 def repair_flicker(before: np.ndarray, label: np.ndarray, after: np.ndarray, support: np.ndarray) -> np.ndarray:
     """Repairs what is wrong in one frame only.
 
-    Where the frames before and after agree and this one does not, theirs is taken if this frame's meshes say the same.
-    Anything that moves fast moves the meshes as well, and is left alone.
+    Where the frames before and after show the same part and this one does not, theirs is taken if this frame's meshes
+    say the same. Anything that moves fast moves the meshes as well, and is left alone; so is what has no mesh, such as
+    hair.
 
     Args:
         before, label, after: uint8 `[H, W]`, labels of three consecutive frames.
@@ -71,7 +72,7 @@ def repair_flicker(before: np.ndarray, label: np.ndarray, after: np.ndarray, sup
     Returns:
         uint8 `[H, W]`.
     """
-    return np.where((before == after) & (before != label) & (support == before), before, label)
+    return np.where((before == after) & (before > 0) & (support == before), before, label)
 
 
 def _spread(label: np.ndarray, holes: np.ndarray, support: np.ndarray) -> np.ndarray:
