@@ -45,7 +45,9 @@ class EvaluateConfig:
     )
     trivial: bool = option(True, "Also judge the trivial answers: background only, mean training image.")
     mean_frames: int = option(64, "Frames a camera, evenly spaced, that make up the mean training image.", min=1)
-    device: str = option("auto", "Device of LPIPS; PSNR and SSIM run on the CPU.", choices=("auto", "cpu", "cuda"))
+    device: str = option(
+        "auto", "Device of all metrics; it moves no digit that a table shows.", choices=("auto", "cpu", "cuda")
+    )
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 No model and no GPU: a render is a set of images, and so is the truth. The truth is composited on the protocol's
 background with the crop's coverage, I = a rgb + (1 - a) background, in float32 sRGB, and is not rounded to 8 bits
-again (the render was, when it was stored).
+again (the render was, when it was stored). PSNR and SSIM are float64 throughout; LPIPS is float32 without the shortened
+products (TF32) that GPUs take by default, so devices differ by rounding only (1e-6, three digits are shown).
 
     metric     meaning
     psnr       whole image [dB]; equal images count as 100 dB, so that means stay finite
@@ -15,6 +16,7 @@ Trivial answers, judged in the same way, say what the figures are worth: the bac
 training image (of the same camera where it was trained on, else over all training cameras).
 """
 
+import contextlib
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -122,7 +124,7 @@ def measure(
     with torch.inference_mode():
         for name, features in truth_features.items():
             known = (prediction_features or {}).get(name)
-            own = nets[name].features(prediction.to(features[0].device)) if known is None else known
+            own = nets[name].features(prediction) if known is None else known
             values[f"lpips_{name}"] = float(nets[name].distance(own, features))
     return values
 
@@ -146,7 +148,7 @@ def evaluate(
         foreground_threshold: true coverage from which a pixel is foreground, in [0, 1].
         means: result of ``mean_images``.
         trivial: judge the trivial answers too (LPIPS by the first net only, since it is the costly part).
-        device: device of the LPIPS modules.
+        device: device of the LPIPS modules, where PSNR and SSIM are computed too (in float64 everywhere).
 
     Returns:
         ``per_image`` (list of camera, frame and metrics), ``metrics`` (means over images, psnr etc.), ``count``,
@@ -155,6 +157,29 @@ def evaluate(
     Raises:
         DataError: no pair at all, or a prediction of another size than its truth.
     """
+    with _full_precision():
+        return _evaluate(pairs, background, nets, foreground_threshold, means, trivial, device)
+
+
+@contextlib.contextmanager
+def _full_precision() -> Iterator[None]:
+    before = torch.backends.cudnn.allow_tf32
+    torch.backends.cudnn.allow_tf32 = False
+    try:
+        yield
+    finally:
+        torch.backends.cudnn.allow_tf32 = before
+
+
+def _evaluate(
+    pairs: Iterable[Pair],
+    background: Sequence[float],
+    nets: Mapping[str, LPIPS],
+    foreground_threshold: float,
+    means: Mapping[str, np.ndarray] | None,
+    trivial: bool,
+    device: str,
+) -> dict:
     per_image: list[dict] = []
     answers: dict[str, list[dict]] = {}
     seen = {"prediction": hashlib.sha256(), "truth": hashlib.sha256()}
@@ -174,11 +199,11 @@ def evaluate(
             raise DataError.of("render", where, expected=f"{size[0]}x{size[1]}, as before", found=f"{width}x{height}")
         seen["prediction"].update(where.encode() + pair.prediction.tobytes())
         seen["truth"].update(where.encode() + pair.rgb.tobytes() + pair.alpha.tobytes())
-        truth = _tensor(composite(pair.rgb, pair.alpha, background))
-        mask = torch.from_numpy(pair.alpha >= foreground_threshold * 255)[None]
+        truth = _tensor(composite(pair.rgb, pair.alpha, background), device)
+        mask = torch.from_numpy(pair.alpha >= foreground_threshold * 255)[None].to(device)
         with torch.inference_mode():
-            features = {name: net.features(truth.to(device)) for name, net in nets.items()}
-        prediction = _tensor(pair.prediction.astype(np.float32) / np.float32(255))
+            features = {name: net.features(truth) for name, net in nets.items()}
+        prediction = _tensor(pair.prediction.astype(np.float32) / np.float32(255), device)
         per_image.append(
             {"camera": pair.camera, "frame": pair.frame, **measure(prediction, truth, mask, nets, features)}
         )
@@ -186,9 +211,9 @@ def evaluate(
             continue
         for answer, key, make in _trivial_answers(pair, background, means):
             if key not in cached:
-                image = _tensor(make())
+                image = _tensor(make(), device)
                 with torch.inference_mode():
-                    known = {first: nets[first].features(image.to(device))} if first is not None else {}
+                    known = {first: nets[first].features(image)} if first is not None else {}
                 cached[key] = (image, known)
             image, known = cached[key]
             answers.setdefault(answer, []).append(
@@ -235,5 +260,5 @@ def _means(values: Sequence[Mapping[str, object]]) -> dict[str, float | None]:
     return result
 
 
-def _tensor(image: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]
+def _tensor(image: np.ndarray, device: str) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].to(device)

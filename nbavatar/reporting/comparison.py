@@ -13,10 +13,10 @@ from nbavatar.reporting.pictures import data_uri, error_map, reduce_picture, spr
 
 __all__ = ["ROWS", "Column", "Comparison", "Rendered", "compare_frames", "find_truth", "to_strip"]
 
-ROWS = ("whole", "contact", "coverage", "error")
+ROWS = ("whole", "zoom", "coverage", "error")
 _WORDS = {
     "whole": "{} ({})",
-    "contact": "{} at the contact ({})",
+    "zoom": "zoom into {} ({})",
     "coverage": "coverage of {} ({})",
     "error": "error map of {} ({})",
 }
@@ -45,7 +45,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One frame of one camera; the window (x0, y0, x1, y1) [px] is what the row ``contact`` enlarges."""
+    """One frame of one camera; the window (x0, y0, x1, y1) [px] is what the row ``zoom`` enlarges."""
 
     camera: str
     frame: str
@@ -105,16 +105,14 @@ def _compare(name: str, group: Sequence[Rendered], crops: Sequence[FramePack]) -
         truth = _composite(crop.read("rgb", frame), alpha, group[0].background)
         window = contact_window(crop.read("label", frame) if "label" in crop.layers else None, alpha)
         picture = np.round(truth * 255).astype(np.uint8)
-        columns.append(
-            Column("Ground truth", {"whole": picture, "contact": cut(picture, window), "coverage": alpha}, {})
-        )
+        columns.append(Column("Ground truth", {"whole": picture, "zoom": cut(picture, window), "coverage": alpha}, {}))
     for render in group:
         if name not in render.pack.frames:
             continue
         rgb = render.pack.read("rgb", name)
         pictures = {"whole": rgb}
         if window is not None:
-            pictures["contact"] = cut(rgb, window)
+            pictures["zoom"] = cut(rgb, window)
         if "nb_alpha" in render.pack.layers:
             pictures["coverage"] = render.pack.read("nb_alpha", name)
         if truth is not None and truth.shape == rgb.shape:
@@ -138,7 +136,7 @@ def to_strip(comparison: Comparison, *, max_side: int) -> Strip:
             for row in ROWS
             if row in column.pictures
         ]
-        caption = _figures(column.figures) or ("whole, at the contact, coverage" if frame else "")
+        caption = _figures(column.figures) or ("whole, zoom at the contact, coverage" if frame else "")
         cards.append(Card(column.title, pictures, caption, max(height, width) <= 128, frame))
     return Strip(where, cards)
 

@@ -122,7 +122,7 @@ def test_page_is_self_contained_and_accessible(run):
 def test_page_shows_truth_renders_errors_masks_and_figures(run):
     text = build(*run, "--cfg", '{"frames": 2}')
     for words in (
-        "Ground truth (camera 102, frame 0000)", "no_nb (camera 102, frame 0005)", "full at the contact (camera 102",
+        "Ground truth (camera 102, frame 0000)", "no_nb (camera 102, frame 0005)", "zoom into full (camera 102",
         "error map of full (camera 102", "coverage of full (camera 102", "PSNR 20.50, SSIM 0.900, LPIPS 0.100",
         "PSNR on the training view", "PSNR [dB]", "Training preview of S2/full", "abcdef012345", "ablation.csv",
     ):  # fmt: skip
