@@ -99,17 +99,28 @@ def _widened(low: float, high: float) -> tuple[float, float]:
 
 
 def _ticks(low: float, high: float, log: bool) -> list[tuple[float, str]]:
-    """Round positions inside a range and their labels."""
-    if log and high - low >= 1:
-        first, last = math.ceil(low - 1e-9), math.floor(high + 1e-9)
-        step = max(1, math.ceil((last - first + 1) / 6))
-        return [(float(k), f"{10.0**k:g}") for k in range(first, last + 1, step)]
+    """Round positions inside a range and their labels; on a log axis the range and the positions are exponents."""
+    if log:
+        return _log_ticks(low, high)
+    return [(value, f"{value:g}" if abs(value) < 1e5 else f"{value / 1000:g}k") for value in _round_values(low, high)]
+
+
+def _log_ticks(low: float, high: float) -> list[tuple[float, str]]:
+    first, last = math.floor(low), math.ceil(high)
+    for digits in ((1,), (1, 3), (1, 2, 5)):
+        values = [d * 10.0**k for k in range(first, last + 1) for d in digits]
+        inside = [v for v in values if low - 1e-9 <= math.log10(v) <= high + 1e-9]
+        if len(inside) >= 3:
+            inside = inside[:: math.ceil(len(inside) / 6)]
+            break
+    else:  # less than a decade: as on a linear axis
+        inside = [v for v in _round_values(10**low, 10**high) if v > 0]
+    return [(math.log10(v), f"{v:g}") for v in inside]
+
+
+def _round_values(low: float, high: float) -> list[float]:
     raw = (high - low) / 4
     unit = 10 ** math.floor(math.log10(raw))
-    step = next(unit * m for m in (1, 2, 5, 10) if unit * m >= raw)
-    first = math.ceil(low / step - 1e-9)
-    values = [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
-    return [
-        (v, f"{10**v:.2g}" if log else f"{v:g}" if abs(v) < 1e5 else f"{v / 1000:g}k")
-        for v in (round(v, 12) for v in values)
-    ]
+    step = next(unit * m for m in (1, 2, 5, 10) if unit * m >= raw * 0.999)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [float(f"{k * step:.12g}") for k in range(first, last + 1)]

@@ -165,6 +165,8 @@ def curves_section(histories: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
             )
             for avatar, events in histories.items()
         }
+        if name == "shrink" and len({y for points in series.values() for _, y in points}) == 1:
+            continue  # one resolution throughout: nothing to see
         chart = line_chart(title, series, x_label="step", y_label=y_label, log_y=log_y)
         if chart:
             charts.append(chart)

@@ -210,6 +210,20 @@ def test_chart_leaves_out_what_cannot_be_drawn_and_labels_its_axes():
     assert "nan" not in flat and "inf" not in flat
 
 
+@pytest.mark.parametrize(
+    ("values", "labels"),
+    [
+        ((0.0063, 0.12), ["0.01", "0.03", "0.1"]),
+        ((1e-6, 2.0), ["1e-06", "0.0001", "0.01", "1"]),
+        ((0.27, 0.31), ["0.27", "0.28", "0.29", "0.3", "0.31"]),
+        ((0.5, 40.0), ["1", "3", "10", "30"]),
+    ],
+)
+def test_log_axes_have_round_labels(values, labels):
+    chart = line_chart("T", {"a": [(0.0, values[0]), (1.0, values[1])]}, x_label="x", y_label="y", log_y=True)
+    assert re.findall(r'text-anchor="end">([^<]+)<', chart) == labels
+
+
 def test_markdown_of_tables():
     table = "| h | k |\n| --- | ---: |\n| *block* |  |\n| r | **1** <u>2</u> |\n"
     text = f"## A\n\npara *i* `c`\n\n{table}\n- n\n\nSources:\n\n- `f`\n"
