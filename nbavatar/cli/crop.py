@@ -27,6 +27,7 @@ from nbavatar.data.sequences import read_sequence
 from nbavatar.data.sources import LAYERS
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.image.crop import Window, resize_area, resize_labels
+from nbavatar.image.foreground import estimate_foreground
 from nbavatar.io.framepack import FramePack, FramePackWriter
 from nbavatar.provenance import run_record
 
@@ -78,8 +79,9 @@ def main(args: argparse.Namespace) -> None:
                 label = window.cut(masks.read("label", frame), labels=True)
                 alpha = window.cut(masks.read("alpha", frame))
                 rgb = window.cut(pack.read("rgb", frame))
-                out.add("rgb", frame, resize_area(rgb, plan.size))
+                rgb = resize_area(rgb, plan.size)
                 label, alpha = resize_labels(label, alpha, plan.size)
+                out.add("rgb", frame, estimate_foreground(rgb, alpha) if cfg.edge_color else rgb)
                 out.add("label", frame, label)
                 out.add("alpha", frame, alpha)
 

@@ -68,7 +68,7 @@ def plan_crop(
         windows = [padded_square(camera.width, camera.height, multiple)] * len(frames)
     else:
         assert boxes is not None
-        valid = np.isfinite(boxes).all(axis=1)
+        valid = np.asarray(np.isfinite(boxes).all(axis=1))
         missing = [frame for frame, good in zip(frames, valid) if not good]
         if not valid.any():
             raise DataError.of(f"camera {camera.name}", "boxes", expected="at least one valid box", found="none")

@@ -145,7 +145,8 @@ def _own_shape(
     """The subject's shape, from `accurate_shapes` or else the median over frames; all frames must agree with it."""
     path = subject.own_shape
     stored = read_pickle(path) if path.is_file() else None
-    shapes, report = {}, {"shape_source": "accurate_shapes" if stored is not None else "median over frames"}
+    shapes: dict[str, np.ndarray] = {}
+    report: dict[str, Any] = {"shape_source": "accurate_shapes" if stored is not None else "median over frames"}
     for part, name in (("head", "shape_params"), ("right_hand", "betas")):
         frames = parameters[part][name]
         shape = np.median(frames, axis=0)

@@ -11,6 +11,7 @@ from nbavatar.data.capture import Capture, read_coverage, read_mask, read_rgb
 from nbavatar.data.decaf import DecafSubject
 from nbavatar.data.frame_plan import FramePlan
 from nbavatar.errors import DataError
+from nbavatar.image.clean import spread_labels
 from nbavatar.io.video import probe_video, read_video
 
 __all__ = ["LAYERS", "capture_images", "capture_layers", "decaf_images"]
@@ -102,13 +103,8 @@ def capture_images(
 
 def _agree(label: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels spread to all covered pixels; labels where nothing is covered are dropped."""
-    orphan = (alpha > 0) & (label == 0)
     label = np.where(alpha > 0, label, np.uint8(0))
+    orphan = (alpha > 0) & (label == 0)
     if orphan.any():
-        if not label.any():
-            return label, np.zeros_like(alpha)
-        from scipy.ndimage import distance_transform_edt
-
-        rows, columns = distance_transform_edt(label == 0, return_distances=False, return_indices=True)
-        label = np.where(orphan, label[rows, columns], label)
-    return label, alpha
+        label = np.where(orphan, spread_labels(label), label)
+    return label, np.where(label > 0, alpha, np.uint8(0))

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-__all__ = ["clean_labels", "repair_flicker", "threshold_matte"]
+__all__ = ["clean_labels", "repair_flicker", "spread_labels", "threshold_matte"]
 
 
 def threshold_matte(matte: np.ndarray, threshold: int) -> np.ndarray:
@@ -55,7 +55,9 @@ def clean_labels(label: np.ndarray, support: np.ndarray, *, hole_fraction: float
     fill = inner & (areas < hole_fraction * total) & (2 * inside >= areas)
     fill[0] = False
     holes = fill[pieces]
-    return _spread(result, holes, support) if holes.any() else result
+    if not holes.any():
+        return result
+    return np.where(holes, np.where(support > 0, support, spread_labels(result)), result)
 
 
 def repair_flicker(before: np.ndarray, label: np.ndarray, after: np.ndarray, support: np.ndarray) -> np.ndarray:
@@ -75,11 +77,12 @@ def repair_flicker(before: np.ndarray, label: np.ndarray, after: np.ndarray, sup
     return np.where((before == after) & (before > 0) & (support == before), before, label)
 
 
-def _spread(label: np.ndarray, holes: np.ndarray, support: np.ndarray) -> np.ndarray:
-    """Fills holes by the meshes' labels, and by the nearest label where there is no mesh."""
-    known = np.where(label > 0, np.uint8(0), np.uint8(1))
-    _, nearest = cv2.distanceTransformWithLabels(known, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+def spread_labels(label: np.ndarray) -> np.ndarray:
+    """The nearest label at every pixel, uint8 `[H, W]`; all zero if there is none."""
+    if not label.any():
+        return label
+    away = np.where(label > 0, np.uint8(0), np.uint8(1))
+    _, nearest = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     table = np.zeros(int(nearest.max()) + 1, dtype=np.uint8)
     table[nearest[label > 0]] = label[label > 0]
-    filled = np.where(support > 0, support, table[nearest])
-    return np.where(holes, filled, label)
+    return table[nearest]

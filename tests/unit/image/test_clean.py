@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from nbavatar.image.clean import clean_labels, repair_flicker, threshold_matte
+from nbavatar.image.clean import clean_labels, repair_flicker, spread_labels, threshold_matte
 
 OPTIONS = {"hole_fraction": 0.01, "island_fraction": 0.05}
 
@@ -70,3 +70,11 @@ def test_flicker_of_one_frame_is_repaired_where_the_mesh_agrees():
     hair = still.copy()
     hair[0:4, 4:28] = 1  # no mesh there
     np.testing.assert_array_equal(repair_flicker(still, hair, still, support), hair)
+
+
+def test_labels_spread_to_the_nearest():
+    label = np.zeros((40, 60), np.uint8)
+    label[20, 10], label[20, 50] = 1, 3
+    spread = spread_labels(label)
+    assert (spread[:, :29] == 1).all() and (spread[:, 32:] == 3).all()
+    assert not spread_labels(np.zeros_like(label)).any()
