@@ -168,10 +168,12 @@ def dent(
     if not len(samples):
         return Dent(offset, 0, 0.0)
     inward = -vertex_normals(head, surface.faces)
-    # the bending direction must not swirl at fine wrinkles (lips, nostrils): average over the neighbourhood
+    # the direction must not swirl at fine folds (lips, nostrils): average it over about a centimetre
+    ends = surface.faces[:, [0, 1]]
+    edge = float(np.median(np.linalg.norm(head[ends[:, 0]] - head[ends[:, 1]], axis=1)))
     ring = sp.coo_matrix((np.ones(3 * len(surface.faces)), (surface.faces.ravel(), np.roll(surface.faces, 1, 1).ravel())), (len(head),) * 2)
     ring = sp.csr_matrix(ring + ring.T + sp.eye(len(head)))
-    for _ in range(3):
+    for _ in range(int(np.clip((0.011 / edge) ** 2, 2, 30))):
         inward = ring @ inward
         inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
     target = np.zeros_like(head)
@@ -181,14 +183,15 @@ def dent(
     for step in range(rounds):
         verts = head + offset
         distance, face, nearest = signed_distance(samples, verts, surface.faces)
-        # only skin that can give way is pushed: not the eyeballs' sockets' depth, not the neck
-        deep = (distance < -tolerance / 4) & surface.movable[surface.faces[face]].all(1)
+        # only skin that can give way is pushed
+        deep = (distance < -tolerance / 4) & surface.movable[surface.faces[face]].any(1)
         push = np.zeros(len(head))
         corners = surface.faces[face[deep]]
         if len(corners):
-            weight = _barycentric(nearest[deep], verts[corners])
+            weight = _barycentric(nearest[deep], verts[corners]) * surface.movable[corners]
+            weight /= np.maximum(weight.sum(1, keepdims=True), 0.2)
             need = -distance[deep] + tolerance / 4
-            share = weight / (weight**2).sum(1, keepdims=True)
+            share = weight / np.maximum((weight**2).sum(1, keepdims=True), 0.05)
             np.maximum.at(push, corners.ravel(), (share * need[:, None]).clip(0, 0.02).ravel() * (weight.ravel() > 0.15))
         close = np.flatnonzero(surface.movable & (np.linalg.norm(verts - hand.mean(0), axis=1) < 0.2))
         inside_depth = 0.0

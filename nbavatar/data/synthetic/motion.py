@@ -23,8 +23,8 @@ class Touch:
         slide: path along the face [m] (3,).
         bend: how far each finger is bent [rad] (5,), index first, thumb last.
         contact: which finger joints carry the touch: (finger, joint, weight).
-        tilt: turn of the hand about the finger direction [rad].
-        lift: least turn of the palm away from the face [rad]; more where the ball of the thumb would meet jaw or neck.
+        tilt: least turn of the hand about the finger direction, the little finger's side away from the face [rad].
+        lift: least turn of the palm away from the face [rad]. Both grow where the hand would meet jaw, neck or eyes.
     """
 
     place: tuple[float, float, float]
@@ -39,9 +39,9 @@ class Touch:
 # Places are seen from a point 80 mm behind and 45 mm below the eyes.
 TOUCHES = {
     "cheek": Touch((-0.72, 0.06, 0.74), (0.15, 0.93, -0.1), (0.0, -0.016, 0.010), (0.16, 0.10, 0.2, 0.28, -0.1), ((0, 2, 1.0), (1, 2, 1.0), (3, 2, 0.6)), 0.1, 0.3),
-    "chin": Touch((-0.40, -0.52, 0.80), (0.75, 0.5, 0.2), (-0.02, 0.004, -0.006), (0.35, 0.35, 0.4, 0.45, 0.1), ((0, 2, 1.0), (1, 2, 1.0)), -0.2, 0.3),
+    "chin": Touch((-0.40, -0.52, 0.80), (0.75, 0.5, 0.2), (-0.02, 0.004, -0.006), (0.38, 0.30, 0.05, 0.14, 0.1), ((0, 2, 1.0), (1, 2, 1.0)), 0.05, 0.25),
     "temple": Touch((-0.74, 0.74, 0.42), (0.25, 0.9, -0.1), (0.0, 0.010, 0.014), (0.25, 0.2, 0.3, 0.45, 0.0), ((0, 2, 1.0), (1, 2, 1.0)), 0.0, 0.3),
-    "mouth": Touch((-0.50, -0.24, 0.88), (0.8, 0.5, 0.0), (-0.02, 0.006, -0.004), (0.2, 0.2, 0.25, 0.35, 0.0), ((0, 2, 1.0), (1, 2, 1.0)), -0.1, 0.3),
+    "mouth": Touch((-0.60, -0.20, 0.80), (0.8, 0.5, 0.0), (-0.02, 0.006, -0.004), (0.25, 0.2, 0.0, 0.1, 0.0), ((0, 2, 1.0), (1, 2, 1.0)), 0.05, 0.25),
 }  # fmt: skip
 
 
@@ -180,7 +180,7 @@ def _expressions(human: Human, u: np.ndarray, rng: np.random.Generator) -> np.nd
 
 
 def touch_frame(
-    touch: Touch, slide: float, lift: float, head: np.ndarray, faces: np.ndarray
+    touch: Touch, slide: float, lift: float, tilt: float, head: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where and how the hand is laid on a head that stands at its rest place.
 
@@ -188,6 +188,7 @@ def touch_frame(
         touch: what kind of touch.
         slide: 0..1 along its path.
         lift: turn of the palm away from the face [rad].
+        tilt: turn about the fingers, the little finger's side away from the face [rad].
         head: (V, 3) skin and eyes [m].
         faces: (F, 3) skin faces.
 
@@ -220,6 +221,6 @@ def touch_frame(
     side = np.cross(normal, along)
     along, normal_ = np.cos(lift) * along - np.sin(lift) * normal, np.cos(lift) * normal + np.sin(lift) * along
     # hand axes: x away from the fingertips, y out of the back of the hand, z to the thumb
-    c, s_ = np.cos(touch.tilt), np.sin(touch.tilt)
+    c, s_ = np.cos(tilt), np.sin(tilt)
     back, thumb = c * normal_ + s_ * side, np.cross(-along, c * normal_ + s_ * side)
     return point, normal, np.stack([-along, back, thumb], axis=1)

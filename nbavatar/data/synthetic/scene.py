@@ -223,13 +223,13 @@ def _lids_and_mouth(human: Human) -> np.ndarray:
     skin, left, _ = human.part_sizes
     eyes = [human.head[skin : skin + left].mean(0), human.head[skin + left :].mean(0)]
     lids = np.min([np.linalg.norm(human.head - eye, axis=1) for eye in eyes], axis=0) < 0.0175
-    mouth = (np.abs(q[:, 0]) < 0.026) & (np.abs(q[:, 1] + 0.075) < 0.03) & (q[:, 2] < 0.006)
+    mouth = (np.abs(q[:, 0]) < 0.026) & (np.abs(q[:, 1] + 0.075) < 0.021) & (q[:, 2] < 0.006)
     return np.flatnonzero(lids | mouth)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Laying:
-    """Lays the hand on the canonical head of each frame; the palm's lift is the same over a whole take."""
+    """Lays the hand on the canonical head of each frame; its turn against the face is the same over a whole take."""
 
     human: Human
     canonical: np.ndarray
@@ -240,39 +240,44 @@ class _Laying:
     motion: Motion
     subject: Subject
     press: float
-    lifts: dict[int, float] = dataclasses.field(default_factory=dict)
+    turns: dict[int, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
     def at(self, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Hand rotation (3, 3), shift (3,) [m] and the skin's normal (3,), in the head's own frame."""
         take = int(self.motion.touch[n])
-        if take not in self.lifts:
+        if take not in self.turns:
             first, last = self.motion.segments[take]
             pressed = [m for m in range(first, last + 1) if self.motion.approach[m] > 0] or [first]
             probes = sorted({pressed[int(i)] for i in np.linspace(0, len(pressed) - 1, 5)})
-            lift = TOUCHES[self.subject.touches[take]].lift
-            while lift < 1.0 and any(self._place(m, lift)[3] for m in probes):
-                lift += 0.08
-            self.lifts[take] = lift
-        return self._place(n, self.lifts[take])[:3]
+            touch = TOUCHES[self.subject.touches[take]]
+            best = -np.inf
+            for step in range(12):
+                turn = (touch.lift + 0.07 * step, touch.tilt + 0.05 * step)
+                clearance = min(self._place(m, *turn)[3] for m in probes)
+                if clearance > best:
+                    best, self.turns[take] = clearance, turn
+                if clearance > 0.003:
+                    break
+        return self._place(n, *self.turns[take])[:3]
 
-    def _place(self, n: int, lift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-        """As `at`, and whether the hand meets something that cannot give way."""
+    def _place(self, n: int, lift: float, tilt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """As `at`, and the distance to what cannot give way [m]."""
         touch = TOUCHES[self.subject.touches[self.motion.touch[n]]]
         head = self.canonical[n]
-        point, normal, rotation = touch_frame(touch, float(self.motion.slide[n]), lift, head, self.skin)
+        point, normal, rotation = touch_frame(touch, float(self.motion.slide[n]), lift, tilt, head, self.skin)
         placed, joints = self.hand[n] @ rotation.T, self.joints[n] @ rotation.T
         shift = point - _pads(touch, joints, placed, normal) + normal * 0.004
         depth = self.press * max(float(self.motion.approach[n]), 0.0)
-        blocked = False
+        clearance = np.inf
         for _ in range(8):
             distance, face, _ = signed_distance(placed + shift, head, self.skin)
-            soft = self.movable[self.skin[face]].all(1)
-            blocked = bool((distance[~soft] < 0.002).any())
+            soft = self.movable[self.skin[face]].any(1)
+            clearance = float(distance[~soft].min()) if not soft.all() else np.inf
             error = (distance[soft].min() if soft.any() else distance.min()) + depth
             shift = shift - normal * error
             if abs(error) < 2e-5:
                 break
-        return rotation, shift, normal, blocked
+        return rotation, shift, normal, clearance
 
 
 def _pads(touch: Touch, joints: np.ndarray, verts: np.ndarray, normal: np.ndarray) -> np.ndarray:
