@@ -78,10 +78,16 @@ class SkinnedPoints:
         arm = arm - self.mass[..., None] * rest[:, None]
         share = torch.einsum("bjac,bpjc->bpja", rotation, arm) + self.mass[..., None] * place[:, None]
 
-        by_shape = torch.einsum(
-            "bjac,pjcs->bpas", rotation, self.shape_dirs - self.mass[..., None, None] * mesh.joint_dirs
-        ) + torch.einsum("pj,bjas->bpas", self.mass, place_by_shape)
-        correctives = torch.einsum("bjac,pjcf->bpaf", rotation, self.pose_dirs) if feature else None
+        # A joint that nothing above turns stays at rest: its share of a derivative is the constant basis.
+        below_any = torch.tensor(_descendants(mesh.parents))[list(self.active)].any(0)
+        moving, still = torch.nonzero(below_any)[:, 0], torch.nonzero(~below_any)[:, 0]
+        turns_of, mass = rotation[:, moving], self.mass[:, moving]
+        lever_dirs = self.shape_dirs[:, moving] - mass[..., None, None] * mesh.joint_dirs[moving]
+        by_shape = _turned(turns_of, lever_dirs) + torch.einsum("pj,bjas->bpas", mass, place_by_shape[:, moving])
+        by_shape = by_shape + self.shape_dirs[:, still].sum(1)
+        correctives = None
+        if feature:
+            correctives = _turned(turns_of, self.pose_dirs[:, moving]) + self.pose_dirs[:, still].sum(1)
         points = torch.cat([share.sum(2), place[:, list(self.joints)]], 1)
         by_shape = torch.cat([by_shape, place_by_shape[:, list(self.joints)]], 1)
 
@@ -144,6 +150,15 @@ def skew(vectors: Tensor) -> Tensor:
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vectors.shape, 3)
+
+
+def _turned(rotation: Tensor, basis: Tensor) -> Tensor:
+    """Sum over joints of `rotation [B, J, 3, 3]` times `basis [P, J, 3, S]`: `[B, P, 3, S]`, as one matrix product."""
+    batch, joints = rotation.shape[:2]
+    points, size = basis.shape[0], basis.shape[3]
+    columns = basis.permute(1, 2, 0, 3).reshape(3 * joints, points * size)
+    rows = rotation.transpose(1, 2).reshape(batch * 3, 3 * joints)
+    return (rows @ columns).reshape(batch, 3, points, size).transpose(1, 2)
 
 
 def _chain(

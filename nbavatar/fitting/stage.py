@@ -158,7 +158,7 @@ def _start(
     cfg: FitConfig,
     threshold: float,
 ) -> tuple[State, State, Prior, dict[str, Any]]:
-    """Start, what was given, prior, summary; frames whose parameters explain less than a rigid alignment does start from the latter."""
+    """Start, what was given, prior, summary; frames that a rigid alignment explains better start from that."""
     count = len(points.points)
     given = start_from_parameters(model, name, extras, count) if cfg.start != "keypoints" else None
     if given is None and cfg.start == "params":

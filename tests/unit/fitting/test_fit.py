@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from nbavatar.benchmarks.fit_scene import WIDTH, perturb
 from nbavatar.bodymodels.files import model_arrays
 from nbavatar.bodymodels.mano import Mano, mirror_model
 from nbavatar.cli import main
@@ -18,7 +19,7 @@ from nbavatar.errors import DataError
 from nbavatar.fitting.stage import Bodies, fit_sequence
 from nbavatar.io.arrays import write_arrays
 
-from .scenes import WIDTH, make_take, vertex_error_mm
+from .scenes import make_take, vertex_error_mm
 
 PLAIN = FitConfig(check_handedness=False)
 
@@ -31,16 +32,10 @@ def _errors(take, fitted):
     return {part: vertex_error_mm(fitted.parts[part].verts, take.truth[part]) for part in fitted.parts}
 
 
-def _perturb(extras, seed=0):
-    """5 mm and 3 degrees on the rigid poses and 3 degrees on every finger joint (root mean square of the norms)."""
-    rng = np.random.default_rng(seed)
-    out = dict(extras)
-    for name in extras:
-        if name.endswith((".global_orient", ".hand_pose")):
-            out[name] = extras[name] + np.deg2rad(3) / 3**0.5 * rng.normal(size=extras[name].shape)
-        if name.endswith(".transl"):
-            out[name] = extras[name] + 0.005 / 3**0.5 * rng.normal(size=extras[name].shape)
-    return out
+def _perturb(extras):
+    """5 mm and 3 degrees on the rigid poses, and 3 degrees on every finger joint."""
+    parameters = {name: value for name, value in extras.items() if name.startswith("param.")}
+    return extras | perturb(parameters, millimetres=5, degrees=3)
 
 
 def test_exact_keypoints_give_exact_meshes():
