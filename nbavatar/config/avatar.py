@@ -14,7 +14,7 @@ _PRECISIONS = ("fp32", "bf16", "fp16")
 class UNetConfig:
     """The deferred renderer R."""
 
-    width: int = option(32, "Channels at full resolution; level i has min(width 2^i, max_width).", min=1)
+    width: int = option(48, "Channels at full resolution; level i has min(width 2^i, max_width).", min=1)
     depth: int = option(5, "Number of stride-2 stages.", min=1, max=8)
     max_width: int = option(512, "Most channels of any level.", min=1)
     convs: int = option(2, "Convolutions a level.", min=1, max=4)
