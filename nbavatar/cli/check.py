@@ -5,7 +5,9 @@
                                           is any. With --out, writes DIR/CAMERA.png, the meshes over that camera's
                                           images with the masks outlined in yellow, and DIR/overview.png: look at them.
   nbavatar check --layout decaf ROOT      lists in one message which files of the dataset and of the body models are
-                                          missing, where to get them and where to put them.
+                                          missing, where to get them and where to put them. If none is, reads every
+                                          subject and says how far its stored landmarks lie from the projected models,
+                                          with and without the lens; with --out, writes DIR/SUBJECT.png.
 
 Lengths are metres, cameras map world to camera (OpenCV axes), pixel centres lie at +0.5.
 """
@@ -19,7 +21,8 @@ import numpy as np
 from nbavatar.cli.common import progress
 from nbavatar.data.capture import read_coverage, read_mask, read_mesh, read_rgb
 from nbavatar.data.capture_check import CaptureReport, check_capture
-from nbavatar.data.decaf import CAMERAS
+from nbavatar.data.decaf import CAMERAS, DecafSubject, find_subject
+from nbavatar.data.decaf_check import SubjectReport, check_subject
 from nbavatar.data.decaf_inventory import missing_files, missing_message
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.images import encode_png
@@ -38,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--subjects", nargs="+", default=["S1", "S2", "S3", "S4"], help="decaf: subjects that are needed"
     )
     parser.add_argument("--cameras", nargs="+", default=list(CAMERAS), help="decaf: cameras that are needed")
-    parser.add_argument("--out", metavar="DIR", help="capture: folder for overlays")
+    parser.add_argument("--out", metavar="DIR", help="folder for overlays")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -50,8 +53,7 @@ def main(args: argparse.Namespace) -> int:
         if missing:
             print(missing_message(root, missing), file=sys.stderr)
             return 2
-        print(f"{root}: all files of {', '.join(args.subjects)} are there")
-        return 0
+        return _check_decaf(root, wanted, Path(args.out) if args.out else None)
     report = check_capture(root, progress)
     if args.out and report.capture is not None:
         _write_overlays(report, Path(args.out))
@@ -64,6 +66,45 @@ def main(args: argparse.Namespace) -> int:
     count = len(report.defects)
     print(f"{root}: {len(report.frames)} frames, {count} defect{'' if count == 1 else 's'}")
     return 2 if report.defects else 0
+
+
+def _check_decaf(root: Path, wanted: dict[str, list[str]], out: Path | None) -> int:
+    """Reads every subject and compares its landmarks with the posed models; 2 if anything is wrong."""
+    count = 0
+    for name, cameras in wanted.items():
+        subject = find_subject(root, name)
+        report = check_subject(subject, cameras)
+        count += len(report.defects)
+        for line in report.notes:
+            print(f"note: {line}")
+        for r in report.reprojection:
+            lens = f"{r.with_lens:.2f} px with the lens, {r.without_lens:.2f} px without"
+            offset = f"median offset ({r.offset[0]:+.2f}, {r.offset[1]:+.2f}) px"
+            print(f"{name} camera {r.camera}: {r.part} landmarks to projected model: {lens}; {offset}")
+        for line in report.defects:
+            print(f"nbavatar check: error: {line}", file=sys.stderr)
+        if out is not None and report.sequence is not None:
+            _write_decaf_sheet(subject, report, out / f"{name}.png")
+    print(f"{root}: all files of {', '.join(wanted)} are there, {count} defect{'' if count == 1 else 's'}")
+    return 2 if count else 0
+
+
+def _write_decaf_sheet(subject: DecafSubject, report: SubjectReport, path: Path) -> None:
+    """The first frame of every camera, bare and under the posed meshes as the lens sees them."""
+    from nbavatar.data.overlays import mesh_over_image
+    from nbavatar.image.overlay import contact_sheet
+    from nbavatar.io.video import read_video
+
+    assert report.sequence is not None
+    meshes = {name: (part.verts[0], part.faces) for name, part in report.sequence.parts.items()}
+    rows = []
+    for name, camera in progress(report.cameras.items(), f"overlays {subject.name}"):
+        image = next(read_video(subject.file("videos", f"{name}.mp4")))
+        matte = next(read_video(subject.file("segmentations", f"{name}.mp4"), gray=True))
+        over = mesh_over_image(image, camera, meshes, (matte > 127).astype(np.uint8))
+        rows.append([(f"{subject.name} {name} frame 0", image), ("meshes, outline of the matte", over)])
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(encode_png(contact_sheet(rows, cell=640), level=6))
 
 
 def _write_overlays(report: CaptureReport, out: Path) -> None:

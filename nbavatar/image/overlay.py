@@ -51,15 +51,20 @@ def contact_sheet(tiles: Sequence[Sequence[tuple[str, np.ndarray]]], *, cell: in
     bar, rows = 18, []
     columns = max((len(row) for row in tiles), default=0)
     for row in tiles:
-        canvas = np.full((cell + bar, columns * cell, 3), 24, dtype=np.uint8)
-        for i, (caption, picture) in enumerate(row):
-            scale = cell / max(picture.shape[:2])
-            size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
-            kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-            small = cv2.resize(picture, size, interpolation=kind)
-            x, y = i * cell + (cell - size[0]) // 2, bar + (cell - size[1]) // 2
-            canvas[y : y + size[1], x : x + size[0]] = small
+        small = [_fitted(picture, cell) for _, picture in row]
+        height = max(picture.shape[0] for picture in small)
+        canvas = np.full((height + bar, columns * cell, 3), 24, dtype=np.uint8)
+        for i, ((caption, _), picture) in enumerate(zip(row, small)):
+            high, wide = picture.shape[:2]
+            x, y = i * cell + (cell - wide) // 2, bar + (height - high) // 2
+            canvas[y : y + high, x : x + wide] = picture
             place = (i * cell + 4, bar - 5)
             cv2.putText(canvas, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (230, 230, 230), 1, cv2.LINE_AA)
         rows.append(canvas)
     return np.concatenate(rows) if rows else np.zeros((bar, bar, 3), dtype=np.uint8)
+
+
+def _fitted(picture: np.ndarray, cell: int) -> np.ndarray:
+    scale = cell / max(picture.shape[:2])
+    size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)

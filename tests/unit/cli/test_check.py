@@ -111,10 +111,13 @@ def test_no_capture(tmp_path, capfd):
 
 def test_decaf_inventory_names_all_that_is_missing_and_where_to_get_it(decaf, tmp_path, capfd):
     here = ["--subjects", "S2", "--cameras", "084", "100"]
+    whole = decaf / "assets/landmark_embedding.npy"
+    content = whole.read_bytes()
+    whole.unlink()
     assert main(["check", "--layout", "decaf", str(decaf), *here]) == 2
     message = capfd.readouterr().err
     assert "1 files" in message and "assets/landmark_embedding.npy" in message and "DECA" in message
-    np.save(decaf / "assets/landmark_embedding.npy", np.zeros(1))
+    whole.write_bytes(content)
     assert main(["check", "--layout", "decaf", str(decaf), *here]) == 0
     assert main(["check", "--layout", "decaf", str(tmp_path / "none")]) == 2
     message = capfd.readouterr().err
@@ -133,3 +136,15 @@ def test_decaf_inventory_names_all_that_is_missing_and_where_to_get_it(decaf, tm
 def test_the_inventory_asks_for_nothing_that_the_release_lacks(capfd, tmp_path):
     assert main(["check", "--layout", "decaf", str(tmp_path), "--subjects", "S5"]) == 2
     assert "111" not in capfd.readouterr().err
+
+
+def test_a_complete_decaf_is_read_and_its_conventions_are_measured(decaf, tmp_path, capfd):
+    here = ["--subjects", "S2", "--cameras", "084", "100", "--out", str(tmp_path / "o")]
+    assert main(["check", "--layout", "decaf", str(decaf), *here]) == 0
+    text = capfd.readouterr().out
+    assert "S2 camera 100: distortion under 'dist_coeffs'" in text and "12 frames in 2 uncut runs" in text
+    assert text.count("landmarks to projected model") == 4 and "0 defects" in text
+    assert decode_image(tmp_path / "o" / "S2.png").shape[0] > 600
+    np.save(decaf / "train/head_keys/S2/084.npy", np.zeros((11, 68, 3)))
+    assert main(["check", "--layout", "decaf", str(decaf), *here[:5]]) == 2
+    assert "head_keys/S2/084.npy: frames: expected 12" in errors(capfd)[0]

@@ -121,6 +121,11 @@ def write_decaf(root: Path, subject: str = "S2", folder: str = "train", *, keys:
     save(assets / "FLAME_neck_idx.npy", np.array([0, 7]))
     save(assets / "neck_idx.npy", np.array([0, 1]))
     models = np.random.default_rng(9)
+    landmarks = {}
+    for name, lead in (("static", (51,)), ("dynamic", (79, 17)), ("full", (1, 68))):
+        landmarks[f"{name}_lmk_faces_idx"] = rng.integers(0, HEAD_VERTS, lead)
+        landmarks[f"{name}_lmk_bary_coords"] = rng.dirichlet(np.ones(3), size=lead)
+    save(assets / "landmark_embedding.npy", np.array(landmarks, dtype=object))
     save(assets / "generic_model.pkl", model(models, [ROOT, 0, 1, 1, 1], HEAD_VERTS, 400, 0.1))
     hand = model(models, [ROOT, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14], HAND_VERTS, 10, 0.05)
     save(assets / "mano_v1_2" / "models" / "MANO_RIGHT.pkl", hand | {"tip_vertices": np.arange(5)})
