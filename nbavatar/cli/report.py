@@ -7,7 +7,7 @@
     --histories  training histories (.jsonl), one a trained avatar, in <subject>/<variant>/; previews in
                  model.pt.state/previews beside them are shown where they exist
     --pictures   further pictures (.png), such as those of the refit and the contact stage
-    --figures    folder for <subject>_<protocol>_<n>.png and .pdf: the same comparisons, for print
+    --figures    folder for <subject>_<protocol>_<n>.png and .pdf, training.png and .pdf: the same for print
     --out        index.html; needs no network and no other file
 
 Every part may be left out; what is not given is not shown.
@@ -73,12 +73,13 @@ def main(args: argparse.Namespace) -> int:
         f"{subject}, protocol {protocol}": [to_strip(comparison, max_side=cfg.max_side) for comparison in group]
         for (subject, protocol), group in comparisons.items()
     }
+    histories = _histories(args.histories)
     if args.figures:
-        _write_figures(Path(args.figures), comparisons)
+        _write_figures(Path(args.figures), comparisons, histories)
     sections = [
         ("tables", "Tables", tables_section(_tables(args.tables))),
         ("pictures", "Comparison with the truth", strips_section(strips) if strips else ""),
-        ("training", "Training", _training(args.histories, cfg)),
+        ("training", "Training", _training(args.histories, histories, cfg)),
         ("stages", "Geometry", pictures_section([_picture(path, cfg) for path in args.pictures])),
         ("provenance", "Provenance", provenance_section([*evals, *speeds]) if evals or speeds else ""),
     ]
@@ -116,33 +117,41 @@ def _renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[Rende
     return found
 
 
-def _write_figures(folder: Path, comparisons: dict[tuple[str, str], list[Comparison]]) -> None:
-    from nbavatar.reporting.figures import comparison_figure, save_figure
+def _write_figures(
+    folder: Path, comparisons: dict[tuple[str, str], list[Comparison]], histories: dict[str, list[dict[str, Any]]]
+) -> None:
+    from nbavatar.reporting.curves import training_curves
+    from nbavatar.reporting.figures import comparison_figure, curves_figure, save_figure
+
+    figures = {}
+    curves = training_curves(histories)
+    if curves:
+        figures["training"] = curves_figure(curves)
 
     for (subject, protocol), group in comparisons.items():
         for number, comparison in enumerate(group):
             rows = [row for row in ROWS if any(row in column.pictures for column in comparison.columns)]
-            figure = comparison_figure(
+            figures[f"{subject}_{protocol}_{number}"] = comparison_figure(
                 [column.title for column in comparison.columns],
                 [[column.pictures.get(row) for column in comparison.columns] for row in rows],
                 rows,
                 error_row="error" in rows,
             )
-            for suffix in ("png", "pdf"):
-                with atomic_write(folder / f"{subject}_{protocol}_{number}.{suffix}") as path:
-                    save_figure(figure, path)
+    for name, figure in figures.items():
+        for suffix in ("png", "pdf"):
+            with atomic_write(folder / f"{name}.{suffix}") as path:
+                save_figure(figure, path)
 
 
-def _training(paths: list[str], cfg: ReportConfig) -> str:
-    if not paths:
-        return ""
+def _histories(paths: list[str]) -> dict[str, list[dict[str, Any]]]:
+    """Logged lines by avatar, named by the last two folders of the file."""
     histories: dict[str, list[dict[str, Any]]] = {}
-    previews = []
     for name in paths:
-        path = Path(name)
-        avatar = "/".join(path.parts[-3:-1])
+        avatar = "/".join(Path(name).parts[-3:-1])
+        if avatar in histories:
+            raise DataError.of(name, expected="one history an avatar", found=f"{avatar} twice")
         try:
-            lines = path.read_text(encoding="utf-8").splitlines()
+            lines = Path(name).read_text(encoding="utf-8").splitlines()
             histories[avatar] = [json.loads(line) for line in lines if line.strip()]
         except FileNotFoundError as error:
             raise DataError.of(name, expected="a training history (.jsonl)", found="no such file") from error
@@ -150,8 +159,16 @@ def _training(paths: list[str], cfg: ReportConfig) -> str:
             raise DataError.of(
                 name, expected="one JSON object a line", found=f"text that does not parse ({error})"
             ) from error
+    return histories
+
+
+def _training(paths: list[str], histories: dict[str, list[dict[str, Any]]], cfg: ReportConfig) -> str:
+    if not paths:
+        return ""
+    previews = []
+    for name, avatar in zip(paths, histories, strict=True):
         # The state folder is no output of the workflow and may be gone; its last preview is a welcome extra.
-        pictures = sorted((path.parent / "model.pt.state" / "previews").glob("*.png"))
+        pictures = sorted((Path(name).parent / "model.pt.state" / "previews").glob("*.png"))
         if pictures:
             title, address, text = _picture(str(pictures[-1]), cfg)
             previews.append((f"{avatar}: {title}", address, f"Training preview of {avatar}: {text}"))

@@ -3,8 +3,10 @@
 import html
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
-__all__ = ["PALETTE", "line_chart", "thin"]
+__all__ = ["PALETTE", "Curve", "line_chart", "thin", "training_curves"]
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision; dashes tell series apart beyond its length.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8A7F00")
@@ -13,6 +15,65 @@ _WIDTH, _HEIGHT = 420, 260
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 12, 30, 44
 
 Series = Mapping[str, Sequence[tuple[float, float]]]
+_NOT_CURVES = {"step", "progress", "skipped", "seconds"}
+# Logged quantity -> title, vertical axis with unit, logarithmic.
+_TITLES = {
+    "psnr": ("PSNR on the training view", "PSNR [dB]", False),
+    "loss": ("Total loss", "loss [1]", True),
+    "total": ("Total loss", "loss [1]", True),
+    "mse": ("Mean squared error", "MSE [1]", True),
+    "lpips": ("LPIPS term", "LPIPS [1]", True),
+    "nb": ("Dice of the billboard silhouette", "1 - Dice [1]", True),
+    "knn": ("Neighbour regulariser", "loss [1]", True),
+    "delta": ("Offset regulariser", "loss [1]", True),
+    "rate": ("Learning-rate factor", "factor [1]", True),
+    "rate_factor": ("Learning-rate factor", "factor [1]", True),
+    "shrink": ("Resolution divisor", "divisor [1]", False),
+    "steps_per_second": ("Training speed", "steps per second [1/s]", False),
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One quantity over the training steps, one series an avatar."""
+
+    title: str
+    y_label: str
+    log_y: bool
+    series: Series
+
+
+def training_curves(histories: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Curve]:
+    """Curves of every logged quantity, the known ones first.
+
+    Args:
+        histories: avatar -> logged lines, each with ``step`` and numbers; a quantity need not be in every line.
+    """
+    names = {
+        name: None
+        for events in histories.values()
+        for event in events
+        for name, value in event.items()
+        if name not in _NOT_CURVES and _is_number(value)
+    }
+    order = [name for name in _TITLES if name in names] + sorted(set(names) - set(_TITLES))
+    curves = []
+    for name in order:
+        title, y_label, log_y = _TITLES.get(name, (name, f"{name} [1]", False))
+        series = {
+            avatar: thin(
+                [(float(e["step"]), float(e[name])) for e in events if _is_number(e.get(name)) and "step" in e]
+            )
+            for avatar, events in histories.items()
+        }
+        if name == "shrink" and len({y for points in series.values() for _, y in points}) == 1:
+            continue  # one resolution throughout: nothing to see
+        curves.append(Curve(title, y_label, log_y, series))
+    return curves
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def thin(points: Sequence[tuple[float, float]], count: int = 200) -> list[tuple[float, float]]:

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nbavatar.reporting.curves import PALETTE
+from nbavatar.reporting.curves import PALETTE, Curve
 from nbavatar.reporting.pictures import ERROR_MAX, RAMP
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["comparison_figure", "save_figure", "sensitivity_figure"]
+__all__ = ["comparison_figure", "curves_figure", "save_figure", "sensitivity_figure"]
 
 _AXES = (
     ("psnr", "PSNR [dB]"),
@@ -47,6 +47,39 @@ def sensitivity_figure(rows: Sequence[Mapping[str, Any]]) -> "Figure":
         axis.spines[["top", "right"]].set_visible(False)
     names = [str(r["setting"]) if r["factor"] == "base" else f"{r['factor']}: {r['setting']}" for r in rows]
     axes[0].set_yticks(positions, names)
+    return figure
+
+
+def curves_figure(curves: Sequence[Curve]) -> "Figure":
+    """Training curves: one panel a quantity, one line an avatar, a common legend."""
+    from matplotlib.figure import Figure
+
+    across = min(3, len(curves))
+    down = -(-len(curves) // across)
+    figure = Figure(figsize=(3.2 * across, 2.3 * down + 0.5), layout="constrained", dpi=200)
+    axes = figure.subplots(down, across, squeeze=False).ravel()
+    for axis in axes[len(curves) :]:
+        axis.axis("off")
+    for axis, curve in zip(axes, curves, strict=False):
+        for number, (name, points) in enumerate(curve.series.items()):
+            style = ("-", "--", ":", "-.")[number // len(PALETTE) % 4]
+            colour = PALETTE[number % len(PALETTE)]
+            marker = "o" if len(points) == 1 else ""
+            if points:
+                xs, ys = zip(*points, strict=True)
+                axis.plot(xs, ys, style, color=colour, linewidth=1.2, marker=marker, markersize=3, label=name)
+        if curve.log_y and any(y > 0 for points in curve.series.values() for _, y in points):
+            axis.set_yscale("log")
+        axis.set_title(curve.title, fontsize=9)
+        axis.set_xlabel("step", fontsize=8)
+        axis.set_ylabel(curve.y_label, fontsize=8)
+        axis.tick_params(labelsize=7)
+        axis.grid(linewidth=0.4, alpha=0.6)
+        axis.spines[["top", "right"]].set_visible(False)
+    handles, names = axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, names, loc="outside lower center", ncols=min(5, max(1, len(names))), fontsize=7, frameon=False
+    )
     return figure
 
 

@@ -19,6 +19,8 @@ _CSV = (
     "table", "panel", "block", "row", "column", "text", "value", "mark", "comparable", "shown", "source", "digest",
     "protocol_hash", "size", "note",
 )  # fmt: skip
+# Shrinks what is wider than the line and leaves the rest alone.
+_FIT = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
 _SPECIAL = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "—": "---", "×": r"$\times$",
@@ -115,14 +117,14 @@ def to_latex(table: Table) -> str:
     for panel in table.panels:
         body = _latex_tabular(table, panel)
         if len(table.panels) == 1:
-            parts += ["\\resizebox{\\ifdim\\width>\\textwidth\\textwidth\\else\\width\\fi}{!}{%", *body, "}"]
+            parts += [_FIT, *body, "}"]
         else:
             width = f"{0.98 / len(table.panels):.2f}"
             parts += [
                 f"\\begin{{subtable}}[t]{{{width}\\linewidth}}",
                 "\\centering",
                 f"\\caption{{\\textbf{{{_escape(panel.title)}}}}}",
-                "\\resizebox{\\linewidth}{!}{%",
+                _FIT,
                 *body,
                 "}",
                 "\\end{subtable}",

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
-from nbavatar.reporting.curves import line_chart, thin
+from nbavatar.reporting.curves import line_chart, training_curves
 from nbavatar.reporting.markdown import markdown_to_html
 from nbavatar.reporting.pictures import ERROR_MAX, RAMP
 
@@ -136,40 +136,11 @@ def curves_section(histories: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     Args:
         histories: avatar -> logged lines, each with ``step`` and numbers.
     """
-    skipped = {"step", "progress", "skipped", "seconds"}
-    names: dict[str, None] = {}
-    for events in histories.values():
-        for event in events:
-            names.update(dict.fromkeys(k for k, v in event.items() if k not in skipped and _is_number(v)))
-    titles = {
-        "psnr": ("PSNR on the training view", "PSNR [dB]", False),
-        "loss": ("Total loss", "loss [1]", True),
-        "total": ("Total loss", "loss [1]", True),
-        "mse": ("Mean squared error", "MSE [1]", True),
-        "lpips": ("LPIPS term", "LPIPS [1]", True),
-        "nb": ("Dice of the billboard silhouette", "1 - Dice [1]", True),
-        "knn": ("Neighbour regulariser", "loss [1]", True),
-        "delta": ("Offset regulariser", "loss [1]", True),
-        "rate": ("Learning-rate factor", "factor [1]", True),
-        "rate_factor": ("Learning-rate factor", "factor [1]", True),
-        "shrink": ("Resolution divisor", "divisor [1]", False),
-        "steps_per_second": ("Training speed", "steps per second [1/s]", False),
-    }
-    order = [name for name in titles if name in names] + sorted(set(names) - set(titles))
-    charts = []
-    for name in order:
-        title, y_label, log_y = titles.get(name, (name, f"{name} [1]", False))
-        series = {
-            avatar: thin(
-                [(float(e["step"]), float(e[name])) for e in events if _is_number(e.get(name)) and "step" in e]
-            )
-            for avatar, events in histories.items()
-        }
-        if name == "shrink" and len({y for points in series.values() for _, y in points}) == 1:
-            continue  # one resolution throughout: nothing to see
-        chart = line_chart(title, series, x_label="step", y_label=y_label, log_y=log_y)
-        if chart:
-            charts.append(chart)
+    charts = [
+        line_chart(curve.title, curve.series, x_label="step", y_label=curve.y_label, log_y=curve.log_y)
+        for curve in training_curves(histories)
+    ]
+    charts = [chart for chart in charts if chart]
     if not charts:
         return "<p>No training history was given.</p>"
     return '<div class="charts">\n' + "\n".join(f"<div>{chart}</div>" for chart in charts) + "\n</div>"
@@ -242,10 +213,6 @@ def page(title: str, label: str, sections: Sequence[tuple[str, str, str]]) -> st
         f"<h1>{html.escape(title)}</h1>\n{warning}\n<nav>{links}</nav>\n<main>\n{body}\n</main>\n"
         f"<script>\n{script}</script>\n</body>\n</html>\n"
     )
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _safe(text: str) -> str:

@@ -144,7 +144,7 @@ def test_figures_for_print(run):
     folder, options = run
     build(folder, options, "--figures", str(folder / "figures"), "--cfg", '{"frames": 1}')
     names = sorted(path.name for path in (folder / "figures").iterdir())
-    assert names == ["S2_nv1024_0.pdf", "S2_nv1024_0.png"]
+    assert names == ["S2_nv1024_0.pdf", "S2_nv1024_0.png", "training.pdf", "training.png"]
     first = {path.name: path.read_bytes() for path in (folder / "figures").iterdir()}
     assert first["S2_nv1024_0.pdf"].startswith(b"%PDF")
     shown = decode_image(first["S2_nv1024_0.png"])
