@@ -39,6 +39,11 @@ class FitConfig:
     smooth_expression: float = option(
         0.5, "Typical acceleration of expression coefficients, 0 for none [1 / frame^2].", min=0.0
     )
+    silhouette_weight: float = option(0.05, "Weight of a contour point against a keypoint; 0 leaves masks alone.", min=0.0)
+    silhouette_frames: int = option(24, "Frames whose masks are used, spread over the sequence.", min=1)
+    silhouette_lines: int = option(270, "Height that masks are reduced to [px].", min=16, max=2160)
+    silhouette_band_px: float = option(20.0, "How far contours are drawn to a border [px at 1080 image lines].", min=0.0)
+    silhouette_deviation_px: float = option(2.0, "Typical error of a mask's border [px at 1080 image lines].", min=0.01)
     check_handedness: bool = option(True, "Whether to try the other hand's model too, and report which fits.")
     sheet_frames: int = option(4, "Frames on the contact sheet.", min=1, max=64)
     sheet_cameras: int = option(4, "Cameras on the contact sheet.", min=1, max=16)
@@ -77,7 +82,7 @@ class DeformConfig:
     max_dent: float = option(0.035, "Longest way a point of the skin may move [m].", min=0.0, max=1.0)
     hand_stiffness: float = option(1.0e4, "How firmly the track holds a hand's position [N/m].", min=0.0, max=1.0e12)
     hand_turn_stiffness: float = option(
-        10.0, "How firmly the track holds a hand's rotation [N m].", min=0.0, max=1.0e12
+        50.0, "How firmly the track holds a hand's rotation [N m].", min=0.0, max=1.0e12
     )
     hand_shift: float = option(0.004, "Bound of the correction of a hand's position; 0 keeps it [m].", min=0.0, max=0.1)
     hand_turn: float = option(0.05, "Bound of the correction of a hand's rotation; 0 keeps it [rad].", min=0.0, max=1.0)

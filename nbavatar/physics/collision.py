@@ -3,10 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
 
 from nbavatar.mesh.bvh import DeformingMesh, surface_points
 
-__all__ = ["Contacts", "Overlap", "find_contacts", "measure_overlap", "outside_free"]
+__all__ = ["Contacts", "Overlap", "estimate_overlap", "find_contacts", "measure_overlap", "outside_free"]
 
 # Steps by which the way out of a hand is searched along the inward normal [m].
 _MARCH = np.arange(1, 17) * 0.002
@@ -20,6 +22,7 @@ class Contacts(NamedTuple):
         normals: unit vectors from the head to the hand, (C, 3).
         ids: head vertices, (C, 3); `weights` their barycentric weights (C, 3).
         hand: index of the hand, (C,).
+        depth: how far each is inside the other part [m], (C,), negative outside.
         anchor: hand vertices that the point is made of, (C, 3); `anchor_weights` (C, 3).
     """
 
@@ -28,6 +31,7 @@ class Contacts(NamedTuple):
     ids: np.ndarray
     weights: np.ndarray
     hand: np.ndarray
+    depth: np.ndarray
     anchor: np.ndarray
     anchor_weights: np.ndarray
 
@@ -60,21 +64,82 @@ def outside_free(head: DeformingMesh, hand: DeformingMesh, distance: float) -> b
 
 
 def measure_overlap(head: DeformingMesh, hand: DeformingMesh, count: tuple[int, int], radius: float) -> Overlap:
-    """Distances within a radius, and depths at any depth.
+    """Distances within a radius, and depths at any depth, inside by winding number.
 
     Args:
         head: the head; `hand`: one hand.
         count: numbers of vertices of head and hand (the meshes also hold the hubs of closed holes).
         radius: how far outside distances are wanted [m].
     """
-    hand_depth, hand_distance = _depths(head, hand.verts[: count[1]], radius)
+    return _overlap(head, hand, count, radius, None)
+
+
+def estimate_overlap(
+    head: DeformingMesh,
+    hand: DeformingMesh,
+    edges: tuple[np.ndarray, np.ndarray],
+    count: tuple[int, int],
+    radius: float,
+) -> Overlap:
+    """`measure_overlap`, several times faster.
+
+    Near the surface the side is told by pseudonormals. Vertices farther away than half the longest edge are on the same
+    side as their neighbours that are far too, as no edge between them can cross the surface: one winding number for each
+    connected group.
+
+    Args:
+        edges: edges of head and hand, (E, 2) and (Eh, 2) int64; the rest as in `measure_overlap`.
+    """
+    return _overlap(head, hand, count, radius, edges)
+
+
+def _overlap(
+    head: DeformingMesh,
+    hand: DeformingMesh,
+    count: tuple[int, int],
+    radius: float,
+    edges: tuple[np.ndarray, np.ndarray] | None,
+) -> Overlap:
+    points = hand.verts[: count[1]]
+    hand_depth, hand_distance = (
+        _depths(head, points, radius) if edges is None else _quick(head, points, edges[1], radius)
+    )
     head_depth, head_distance = np.zeros(count[0]), np.full(count[0], np.inf)
     low, high = hand.box()
     points = head.verts[: count[0]]
-    near = np.flatnonzero(((points >= low - radius) & (points <= high + radius)).all(axis=1))
+    boxed = ((points >= low - radius) & (points <= high + radius)).all(axis=1)
+    near = np.flatnonzero(boxed)
     if len(near):
-        head_depth[near], head_distance[near] = _depths(hand, np.ascontiguousarray(points[near]), radius)
+        points = np.ascontiguousarray(points[near])
+        if edges is None:
+            head_depth[near], head_distance[near] = _depths(hand, points, radius)
+        else:
+            local = np.cumsum(boxed) - 1
+            within = edges[0][boxed[edges[0]].all(axis=1)]
+            head_depth[near], head_distance[near] = _quick(hand, points, local[within], radius)
     return Overlap(hand_depth, head_depth, hand_distance, head_distance)
+
+
+def _quick(mesh: DeformingMesh, points: np.ndarray, edges: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    longest = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1).max(initial=0.0)
+    distance, face, _ = mesh.signed(points, max(radius, 0.51 * float(longest)))
+    depth = np.maximum(-distance, 0.0)
+    low, high = mesh.box()
+    far = (face < 0) & ((points >= low) & (points <= high)).all(axis=1)
+    depth[face < 0] = 0.0
+    if far.any():
+        joined = edges[far[edges].all(axis=1)]
+        graph = scipy.sparse.coo_matrix((np.ones(len(joined), np.int8), joined.T), shape=(len(points),) * 2)
+        _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        ids = np.flatnonzero(far)
+        groups, first, inverse = np.unique(group[ids], return_index=True, return_inverse=True)
+        inside = mesh.inside(np.ascontiguousarray(points[ids[first]]))[inverse]
+        if inside.any():
+            deep = ids[inside]
+            depth[deep] = mesh.closest(np.ascontiguousarray(points[deep]), np.inf)[0]
+    distance = np.abs(distance)
+    distance[distance > radius] = np.inf
+    return depth, distance
 
 
 def _depths(mesh: DeformingMesh, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +147,7 @@ def _depths(mesh: DeformingMesh, points: np.ndarray, radius: float) -> tuple[np.
     inside = mesh.inside(points)
     deep = np.flatnonzero(inside & (face < 0))
     if len(deep):
-        distance[deep] = mesh.closest(points[deep], np.inf)[0]
+        distance[deep] = mesh.closest(np.ascontiguousarray(points[deep]), np.inf)[0]
     return np.where(inside, distance, 0.0), distance
 
 
@@ -95,7 +160,7 @@ def find_contacts(
     radius: float,
     near: float,
 ) -> Contacts:
-    """Contacts of all hands with the head, both ways: hand vertices against head faces, head vertices against hands.
+    """Contacts of all hands with the head, both ways: vertices of either against the faces of the other.
 
     The normal is the direction of the shortest way apart. Where that way would pull the skin outwards (a fingertip that came
     out on the far side, a vertex behind the finger) it is the head's smoothed outward normal instead.
@@ -110,57 +175,55 @@ def find_contacts(
     parts: list[tuple[np.ndarray, ...]] = []
     for h, (hand, count) in enumerate(zip(hands, hand_counts, strict=True)):
         points = hand.verts[:count]
-        distance, face, weight = head.closest(points, radius)
-        found = np.flatnonzero(face >= 0)
+        distance, face, weight = head.signed(points, radius)
+        found = np.flatnonzero((face >= 0) & (distance < near))
         if len(found):
-            inside = head.inside(points[found])
-            keep = inside | (distance[found] < near)
-            found, inside = found[keep], inside[keep]
-        if len(found):
+            depth = -distance[found]
+            inside, distance = depth > 0.0, np.abs(depth)
             face, weight, p = face[found], weight[found], points[found]
             q = surface_points(head.verts, head.faces, face, weight)
             ids = head.faces[face]
             away = _unit(np.einsum("pc,pci->pi", weight, outward[ids]))
-            normal = _direction(p, q, distance[found], inside, away)
+            normal = _direction(p, q, distance, inside, away)
             wrong = (normal * away).sum(1) < 0.2
             normal[wrong] = away[wrong]
             one = np.tile([1.0, 0.0, 0.0], (len(found), 1))
-            parts.append((p, normal, ids, weight, np.full(len(found), h), np.repeat(found[:, None], 3, 1), one))
+            parts.append((p, normal, ids, weight, np.full(len(found), h), depth, np.repeat(found[:, None], 3, 1), one))
         low, high = hand.box()
         x = head.verts[movable]
         boxed = movable[((x >= low - near) & (x <= high + near)).all(axis=1)]
         if not len(boxed):
             continue
         x = head.verts[boxed]
-        distance, face, weight = hand.closest(x, radius)
-        found = np.flatnonzero(face >= 0)
+        distance, face, weight = hand.signed(x, radius)
+        found = np.flatnonzero((face >= 0) & (distance < near))
         if not len(found):
             continue
-        inside = hand.inside(x[found])
-        keep = inside | (distance[found] < near)
-        found, inside = found[keep], inside[keep]
-        if not len(found):
-            continue
+        depth = -distance[found]
+        inside, distance = depth > 0.0, np.abs(depth)
         v, x, face, weight = boxed[found], x[found], face[found], weight[found]
         q = surface_points(hand.verts, hand.faces, face, weight)
         # From hand to head is the direction out of the hand; the contact's normal is its opposite.
-        normal = -_direction(x, q, distance[found], inside, -outward[v])
+        normal = -_direction(x, q, distance, inside, -outward[v])
         wrong = (normal * outward[v]).sum(1) < -0.2
-        for k in np.flatnonzero(wrong):
-            normal[k] = outward[v[k]]
-            if inside[k]:
-                path = x[k] - _MARCH[:, None] * outward[v[k]]
-                out = np.flatnonzero(~hand.inside(path))
-                q[k] = path[out[0]] if len(out) else path[-1]
+        normal[wrong] = outward[v[wrong]]
+        through = np.flatnonzero(wrong & inside)
+        if len(through):
+            paths = x[through, None] - _MARCH[:, None] * outward[v[through], None]
+            blocked = hand.inside(paths.reshape(-1, 3)).reshape(len(through), -1)
+            first = np.where(blocked.all(axis=1), len(_MARCH) - 1, np.argmin(blocked, axis=1))
+            q[through] = paths[np.arange(len(through)), first]
         keep = ~wrong | inside
         one = np.tile([1.0, 0.0, 0.0], (int(keep.sum()), 1))
         ids = np.repeat(v[keep][:, None], 3, axis=1)
         # Head vertices use one weight; the other two entries name the same vertex with weight 0.
-        parts.append((q[keep], normal[keep], ids, one, np.full(len(ids), h), hand.faces[face[keep]], weight[keep]))
+        parts.append(
+            (q[keep], normal[keep], ids, one, np.full(len(ids), h), depth[keep], hand.faces[face[keep]], weight[keep])
+        )
     if not parts:
         none = np.zeros((0, 3))
         no_ids = np.zeros((0, 3), np.int64)
-        return Contacts(none, none, no_ids, none, np.zeros(0, np.int64), no_ids, none)
+        return Contacts(none, none, no_ids, none, np.zeros(0, np.int64), np.zeros(0), no_ids, none)
     return Contacts(*(np.ascontiguousarray(np.concatenate(column)) for column in zip(*parts, strict=True)))
 
 

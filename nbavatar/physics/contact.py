@@ -17,7 +17,8 @@ import scipy.sparse.csgraph
 
 from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.mesh.drawing import vertex_normals
-from nbavatar.physics.collision import Contacts, find_contacts, measure_overlap, outside_free
+from nbavatar.mesh.topology import edges
+from nbavatar.physics.collision import Contacts, estimate_overlap, find_contacts, measure_overlap, outside_free
 from nbavatar.physics.tissue import SoftSurface
 from nbavatar.physics.xpbd import relax
 
@@ -36,9 +37,8 @@ class ContactNumbers:
     density: float = 10.0  # of moving tissue, per area [kg/m^2]
     reach: float = 0.05  # how far from a contact the skin moves, along the surface [m]
     max_dent: float = 0.035  # [m]
-    hand_mass: float = 0.4  # [kg]
     hand_stiffness: float = 1e4  # of the track's hold on the hand's position [N/m]
-    hand_turn_stiffness: float = 10.0  # [N m]
+    hand_turn_stiffness: float = 50.0  # [N m]
     hand_shift: float = 0.004  # bound of the correction [m]
     hand_turn: float = 0.05  # bound of the correction [rad]
     touch: float = 0.002  # nearer than this is contact [m]
@@ -95,9 +95,10 @@ class ContactSolver:
             pinned: ids of head vertices that never move, such as the neck's rim.
         """
         self.surface, self.numbers = surface, numbers
-        self._head = DeformingMesh(head_rest, surface.faces)
-        self._hands = [DeformingMesh(rest, faces) for rest, faces in hands]
+        self._head = _outwards(DeformingMesh(head_rest, surface.faces), head_rest)
+        self._hands = [_outwards(DeformingMesh(rest, faces), rest) for rest, faces in hands]
         self._count, self._hand_counts = len(head_rest), [len(rest) for rest, _ in hands]
+        self._hand_edges = [edges(np.asarray(faces, np.int64)) for _, faces in hands]
         mass = numbers.density * surface.area
         self._inverse_mass = 1.0 / mass
         if pinned is not None:
@@ -108,8 +109,9 @@ class ContactSolver:
         length = np.maximum(np.linalg.norm(head_rest[a] - head_rest[b], axis=1), 1e-9)
         self._graph = scipy.sparse.csr_matrix((length, (a, b)), shape=(self._count,) * 2)
         self._smoother = _smoother(surface)
-        inertia = numbers.hand_mass * 0.05**2
-        self._pose_inverse_mass = np.tile([1.0 / numbers.hand_mass, 1.0 / inertia], (len(hands), 1))
+        # A hand's inertia matches its hold, so that it finds its balance within a few steps at any stiffness.
+        hold = np.maximum([numbers.hand_stiffness, numbers.hand_turn_stiffness], 1e-3) * numbers.time_step**2
+        self._pose_inverse_mass = np.tile(1.0 / hold, (len(hands), 1))
 
     def solve(self, head: np.ndarray, hands: list[np.ndarray], before: FrameResult | None = None,
               head_before: np.ndarray | None = None, hands_before: list[np.ndarray] | None = None) -> FrameResult:  # fmt: skip
@@ -132,6 +134,7 @@ class ContactSolver:
         travel = max(float(np.linalg.norm(a - b, axis=1).max()) for a, b in zip(hands, start, strict=True))
         path = int(np.clip(math.ceil(travel / n.step), 1, n.max_steps))
         x = head + dent
+        old = np.abs(dent).max(axis=1) > 1e-6
         touched = np.zeros(self._count, bool)
         active = np.zeros(0, np.int64)
         last = [self._posed(s, pose[k], centre[k]) for k, s in enumerate(start)]
@@ -145,13 +148,13 @@ class ContactSolver:
             hit = np.unique(contacts.ids)
             if len(hit) and not touched[hit].all():
                 touched[hit] = True
-                active = self._active(touched | (np.linalg.norm(dent, axis=1) > 1e-5))
+                active = self._active(touched, old)
                 local = self._local(active, head)
             if not len(active):
                 last = now
                 continue
             previous = np.einsum("pc,pci->pi", contacts.anchor_weights, _gather(last, contacts))
-            self._relax(x, head, local, contacts, previous, pose, centre, n.iterations)
+            self._relax(x, head, local, contacts, previous, pose, centre, n.iterations, held=step < path)
             last = now
             done += 1
         final = [self._posed(hand, pose[k], centre[k]) for k, hand in enumerate(hands)]
@@ -163,12 +166,12 @@ class ContactSolver:
         n = self.numbers
         self._head.move(head)
         deepest, head_contact, hand_contact = 0.0, np.zeros(self._count, bool), []
-        for mesh, hand, count in zip(self._hands, hands, self._hand_counts, strict=True):
+        for k, (mesh, hand, count) in enumerate(zip(self._hands, hands, self._hand_counts, strict=True)):
             mesh.move(hand)
             if outside_free(self._head, mesh, n.touch):
                 hand_contact.append(np.zeros(count, bool))
                 continue
-            overlap = measure_overlap(self._head, mesh, (self._count, count), n.touch)
+            overlap = estimate_overlap(self._head, mesh, self._edges_with(k), (self._count, count), n.touch)
             deepest = max(deepest, overlap.deepest)
             head_contact |= overlap.head_distance < n.touch
             hand_contact.append(overlap.hand_distance < n.touch)
@@ -192,14 +195,13 @@ class ContactSolver:
                 pose = np.concatenate([p.reshape(-1, 3) @ rotation.T for p in before.pose]).reshape(-1, 6)
                 centre = [hand.mean(axis=0) for hand in hands]
                 posed = [self._posed(s, pose[k], centre[k]) for k, s in enumerate(start)]
-                if self._deepest(head + dent, posed) < 2.0 * n.step:
+                if self._contacts(head + dent, posed, outward, np.zeros(0, np.int64)).depth.max(initial=0.0) < n.step:
                     return dent, pose, start
         pose = np.zeros((len(hands), 6))
         return np.zeros_like(head), pose, [self._retreat(head, k, hand, outward) for k, hand in enumerate(hands)]
 
     def _retreat(self, head: np.ndarray, k: int, hand: np.ndarray, outward: np.ndarray) -> np.ndarray:
         """The hand moved out along the skin's mean normal until it is out of the head."""
-        n = self.numbers
         self._head.move(head)
         mesh, count = self._hands[k], self._hand_counts[k]
         mesh.move(hand)
@@ -231,23 +233,17 @@ class ContactSolver:
             mesh.move(hand)
         movable = active if len(active) else np.arange(self._count)
         near = 0.5 * n.step if near is None else near
-        return find_contacts(self._head, self._hands, self._hand_counts, outward, movable, 4.0 * n.step, near)
+        return find_contacts(self._head, self._hands, self._hand_counts, outward, movable, 2.0 * n.step, near)
 
-    def _deepest(self, x: np.ndarray, hands: list[np.ndarray]) -> float:
-        self._head.move(x)
-        deepest = 0.0
-        for mesh, hand, count in zip(self._hands, hands, self._hand_counts, strict=True):
-            mesh.move(hand)
-            if not outside_free(self._head, mesh, 0.0):
-                deepest = max(deepest, measure_overlap(self._head, mesh, (self._count, count), 1e-3).deepest)
-        return deepest
+    def _edges_with(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        return self.surface.edges, self._hand_edges[k]
 
-    def _active(self, touched: np.ndarray) -> np.ndarray:
-        """Vertices within reach of what is touched, along the surface."""
+    def _active(self, touched: np.ndarray, old: np.ndarray) -> np.ndarray:
+        """Vertices within reach of what is touched, along the surface, and those that were dented before."""
         distance = scipy.sparse.csgraph.dijkstra(
             self._graph, directed=False, indices=np.flatnonzero(touched), limit=self.numbers.reach, min_only=True
         )
-        return np.flatnonzero(np.isfinite(distance))
+        return np.flatnonzero(np.isfinite(distance) | old)
 
     def _local(self, active: np.ndarray, head: np.ndarray) -> tuple[np.ndarray, ...]:
         """Active ids, inverse masses (0 elsewhere), edges with their rest lengths, faces, bulge."""
@@ -261,7 +257,7 @@ class ContactSolver:
 
     def _relax(
         self, x: np.ndarray, head: np.ndarray, local: tuple[np.ndarray, ...], contacts: Contacts, previous: np.ndarray,
-        pose: np.ndarray, centre: np.ndarray, iterations: int,
+        pose: np.ndarray, centre: np.ndarray, iterations: int, held: bool,
     ) -> None:  # fmt: skip
         n, s = self.numbers, self.surface
         active, inverse_mass, pairs, lengths, faces, bulge = local
@@ -269,7 +265,7 @@ class ContactSolver:
         relax(
             x, head, inverse_mass, active, self._support, pairs, lengths, n.stretch, n.shear, s.ring, s.ring_ids, s.ring_weights,
             self._bend, faces, bulge, n.volume, table, contacts.ids, contacts.weights, contacts.hand, pose,
-            self._pose_inverse_mass, np.array([n.hand_stiffness, n.hand_turn_stiffness]),
+            np.zeros_like(pose[:, :2]) if held else self._pose_inverse_mass, np.array([n.hand_stiffness, n.hand_turn_stiffness]),
             np.array([n.hand_shift, n.hand_turn]), centre, n.time_step, iterations, n.friction, n.max_dent,
         )  # fmt: skip
 
@@ -286,9 +282,9 @@ class ContactSolver:
         none, no_faces = np.zeros((0, 2), np.int64), np.zeros((0, 3), np.int64)
         held, still = np.zeros((len(hands), 6)), np.zeros((len(hands), 2))
         for _ in range(n.repair):
-            if self._deepest(x, hands) <= 0.5 * n.tolerance:
-                break
             contacts = self._contacts(x, hands, outward, active, near=2e-4)
+            if contacts.depth.max(initial=0.0) <= 0.5 * n.tolerance:
+                break
             table = np.concatenate((contacts.points, contacts.points, contacts.normals), axis=1)
             # Aim a little outside, so that rounding and neighbours do not undo it.
             table[:, :3] -= 0.2 * n.tolerance * contacts.normals
@@ -324,7 +320,7 @@ class ContactSolver:
 
     def _outward(self, head: np.ndarray) -> np.ndarray:
         """Outward normals of the rest shape, smoothed so that nostrils and lips do not turn them."""
-        normals = vertex_normals(head, self.surface.faces)
+        normals = vertex_normals(head, self._head.faces)
         for _ in range(4):
             normals = self._smoother @ normals
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -334,6 +330,13 @@ class ContactSolver:
         if not pose.any():
             return hand
         return (hand - centre) @ _rotation(pose[3:]).T + centre + pose[:3]
+
+
+def _outwards(mesh: DeformingMesh, rest: np.ndarray) -> DeformingMesh:
+    """The mesh with its faces turned if they look inwards (a mirrored model), so that inside is inside."""
+    corners = mesh.verts[mesh.closed_faces] - mesh.verts.mean(axis=0)
+    volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return mesh if volume >= 0 else DeformingMesh(rest, mesh.faces[:, ::-1])
 
 
 def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
