@@ -44,6 +44,7 @@ rule report:
             for suffix in ("md", "csv")
         ],
         evals=evals_of(ROWS),
+        speeds=sorted({path for table in TABLES for path in speeds_of(table)}),
         renders=renders_of(ROWS),
         frames=sorted(
             {
@@ -67,9 +68,11 @@ rule report:
         runtime="30m",
     params:
         label=RUN.size_label,
+        figures=lambda w, output: str(Path(output[0]).parent / "figures"),
         cfg=options("report"),
         code=code_digest("report"),
     shell:
         "nbavatar report --tables {input.tables} --evals {input.evals} --renders {input.renders}"
-        " --frames {input.frames} --histories {input.histories} --pictures {input.pictures}"
+        " --speeds {input.speeds} --frames {input.frames} --histories {input.histories}"
+        " --pictures {input.pictures} --size-label {params.label:q} --figures {params.figures}"
         " --out {output} --cfg {params.cfg:q} > {log} 2>&1"
