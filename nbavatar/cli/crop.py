@@ -56,14 +56,15 @@ def main(args: argparse.Namespace) -> None:
         lens = None if lens is None else np.array(lens, dtype=np.float64)
         K = pack.intrinsics(frames[0])
         camera = Camera(manifest["camera"], manifest["width"], manifest["height"], K, pack.cam_from_world, lens)
-        boxes, source = None, None
+        boxes, source, missing = None, None, []
         if cfg.kind == "box":
             if not args.meshes:
                 raise ConfigError("--meshes is needed for crops of kind box")
-            boxes, source = frame_boxes(read_sequence(args.meshes)[0], camera, frames)
+            sequence, _ = read_sequence(args.meshes)
+            boxes, source, missing = frame_boxes(sequence, camera, frames, fill=cfg.per_frame)
         options = {key: getattr(cfg, key) for key in ("kind", "size", "pad", "per_frame", "multiple")}
         plan = plan_crop(camera, frames, boxes=boxes, **options)
-        extra = {"subject": manifest["subject"], "camera": camera.name, "boxes": source, "missing_boxes": plan.missing,
+        extra = {"subject": manifest["subject"], "camera": camera.name, "boxes": source, "missing_boxes": missing,
                  "outside": crop_extent(plan, camera), "window": list(plan.windows[frames[0]])}  # fmt: skip
         record = run_record("crop", config=to_mapping(cfg), inputs=inputs, extra=extra)
         layers = {name: LAYERS[name] for name in ("rgb", "label", "alpha")}

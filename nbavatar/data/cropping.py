@@ -25,14 +25,12 @@ class CropPlan:
         size: side of the result [px].
         K: frame -> camera matrix of the result [px]; all equal unless the boxes move.
         moving: whether they do.
-        missing: frames without any valid detection.
     """
 
     windows: dict[str, tuple[int, int, int]]
     size: int
     K: dict[str, np.ndarray]
     moving: bool
-    missing: list[str]
 
 
 def plan_crop(
@@ -61,7 +59,6 @@ def plan_crop(
     Raises:
         DataError: `box` and no valid box in the whole sequence.
     """
-    missing: list[str] = []
     if kind == "center":
         windows = [center_square(camera.width, camera.height)] * len(frames)
     elif kind == "full":
@@ -69,7 +66,6 @@ def plan_crop(
     else:
         assert boxes is not None
         valid = np.asarray(np.isfinite(boxes).all(axis=1))
-        missing = [frame for frame, good in zip(frames, valid) if not good]
         if not valid.any():
             raise DataError.of(f"camera {camera.name}", "boxes", expected="at least one valid box", found="none")
         if per_frame:
@@ -88,16 +84,24 @@ def plan_crop(
         frame: scale_intrinsics(crop_intrinsics(camera.K, x0, y0), scale, scale)
         for frame, (x0, y0, _) in zip(frames, windows)
     }
-    return CropPlan(dict(zip(frames, windows)), result, K, len(set(windows)) > 1, missing)
+    return CropPlan(dict(zip(frames, windows)), result, K, len(set(windows)) > 1)
 
 
-def frame_boxes(sequence: MeshSequence, camera: Camera, frames: Sequence[str]) -> tuple[np.ndarray, str]:
+def frame_boxes(
+    sequence: MeshSequence, camera: Camera, frames: Sequence[str], *, fill: bool = False
+) -> tuple[np.ndarray, str, list[str]]:
     """Box over head and hands of each frame, in the undistorted image.
 
     Tracked boxes are used where the sequence has them for this camera, projected meshes otherwise.
 
+    Args:
+        sequence: meshes, and tracked boxes among its extras.
+        camera: native camera.
+        frames: ids.
+        fill: interpolate each part's missing boxes over time first, so that a lost hand does not shrink the box.
+
     Returns:
-        float64 `[N, 4]` [px], NaN where nothing was detected; and where they come from.
+        float64 `[N, 4]` [px], NaN where nothing was detected; where they come from; frames in which a part is missing.
     """
     rows = sequence.index(frames)
     tracked = [
@@ -105,11 +109,18 @@ def frame_boxes(sequence: MeshSequence, camera: Camera, frames: Sequence[str]) -
         for name in (f"boxes.{part}.{camera.name}" for part in sequence.parts)
         if name in sequence.extras
     ]
-    if tracked:
-        stack = np.stack(tracked)  # [parts, N, 4]
-        boxes = np.stack([union_box(stack[:, i]) for i in range(len(rows))])
-        return np.stack([_undistorted(box, camera) for box in boxes]), "tracked boxes"
-    return np.stack([_mesh_box(sequence, camera, row) for row in rows]), "projected meshes"
+    if not tracked:
+        boxes = np.stack([_mesh_box(sequence, camera, row) for row in rows])
+        lost = np.isnan(boxes).any(axis=1)
+        return (fill_missing(boxes) if fill else boxes), "projected meshes", _named(frames, lost)
+    lost = np.isnan(np.stack(tracked)).any(axis=(0, 2))
+    stack = np.stack([fill_missing(boxes) if fill else boxes for boxes in tracked])  # [parts, N, 4]
+    boxes = np.stack([_undistorted(union_box(stack[:, i]), camera) for i in range(len(rows))])
+    return boxes, "tracked boxes", _named(frames, lost)
+
+
+def _named(frames: Sequence[str], chosen: np.ndarray) -> list[str]:
+    return [frames[i] for i in np.flatnonzero(chosen)]
 
 
 def crop_extent(plan: CropPlan, camera: Camera) -> Mapping[str, float]:
