@@ -23,18 +23,17 @@ from typing import Any
 import numba
 import torch
 from llvmlite import binding
-from numba import njit, types
-from numba.core import caching, cgutils
-from numba.extending import intrinsic
+from numba import njit
+from numba.core import caching
 
-__all__ = ["FAST", "fetch_add", "fixed", "inlined", "kernel", "prepare", "run_workers"]
+__all__ = ["FAST", "inlined", "kernel", "prepare", "run_workers"]
 
 _LOG = logging.getLogger("nbavatar.raster")
 
 # Contraction and reassociation only: comparisons with NaN and infinity must keep their meaning.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
-_SOURCES = ("binning.py", "compile.py", "cpu_kernels.py", "scalar.py", "vector.py")
+_SOURCES = ("binning.py", "compile.py", "cpu_kernels.py", "memory.py", "scalar.py", "vector.py")
 
 
 @cache
@@ -99,34 +98,6 @@ def kernel(function: Callable[..., Any]) -> Any:
 def inlined(function: Callable[..., Any]) -> Any:
     """Compiles a function that its caller absorbs."""
     return njit(nogil=True, fastmath=FAST, error_model="numpy", forceinline=True)(function)
-
-
-@intrinsic
-def fixed(typingctx: Any, array: Any, index: Any) -> Any:
-    """Element of an array that nobody writes while the kernel runs.
-
-    LLVM cannot know that a store to one array leaves another alone, and without that knowledge
-    it vectorises none of our loops; an invariant load says it.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        view = context.make_array(signature.args[0])(context, builder, args[0])
-        value = builder.load(builder.gep(view.data, [args[1]]))
-        value.set_metadata("invariant.load", builder.module.add_metadata([]))
-        return value
-
-    return array.dtype(array, types.intp), generate
-
-
-@intrinsic
-def fetch_add(typingctx: Any, array: Any, amount: Any) -> Any:
-    """Adds to the first element of an int64 array, atomically, and returns what it was."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        view = context.make_array(signature.args[0])(context, builder, args[0])
-        return builder.atomic_rmw("add", cgutils.gep(builder, view.data, 0), args[1], "monotonic")
-
-    return types.int64(array, types.int64), generate
 
 
 @contextlib.contextmanager

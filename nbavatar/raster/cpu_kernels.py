@@ -16,7 +16,8 @@ import numpy as np
 
 from nbavatar.raster import scalar
 from nbavatar.raster.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
-from nbavatar.raster.compile import fetch_add, inlined, kernel
+from nbavatar.raster.compile import inlined, kernel
+from nbavatar.raster.memory import fetch_add, get, move4, pointer, put
 from nbavatar.raster.vector import (
     LANES,
     count_trailing_zeros,
@@ -133,9 +134,9 @@ def _scatter(totals, i00, i01, i10, i11, w00, w01, w10, w11, grads, at, channels
 def _release(pixel, slot, member, queue, through, sums, features, grads, grad_at, hits, chain, last, counts, entry,
              limits, texels, channels, replay):  # fmt: skip
     """Blends the hit in a queue's slot, or, in the replay, notes it."""
-    zero, one, size, step, alpha_max = limits[0], limits[1], limits[2], limits[3], limits[7]
-    s, t, a = queue[slot], queue[slot + 1], queue[slot + 3]
-    passed = through[pixel]
+    zero, one, size, step, alpha_max = get(limits, 0), get(limits, 1), get(limits, 2), get(limits, 3), get(limits, 7)
+    s, t, a = get(queue, slot), get(queue, slot + 1), get(queue, slot + 3)
+    passed = get(through, pixel)
     a = min(a, alpha_max)
     column, row = first_texel(s, size, zero, one), first_texel(t, size, zero, one)
     x0, x1 = weights(s, column, step, zero, one)
@@ -144,25 +145,28 @@ def _release(pixel, slot, member, queue, through, sums, features, grads, grad_at
     right, below = np.int64(step) * channels, np.int64(step) * texels * channels
     i01, i10, i11 = i00 + right, i00 + below, i00 + right + below
     if replay:
-        worth = grads[grad_at + channels]
+        worth = get(grads, grad_at + channels)
         if channels > 0:
             worth += _dot(grads, grad_at, features, i00, i01, i10, i11, y0 * x0, y0 * x1, y1 * x0, y1 * x1, channels,
                           zero)  # fmt: skip
-        number = counts[0]
-        counts[0] = number + 1
-        hits[3 * number], hits[3 * number + 1], hits[3 * number + 2] = worth, a, passed
-        chain[2 * number], chain[2 * number + 1] = entry, last[pixel]
-        last[pixel] = number
+        number = get(counts, 0)
+        put(counts, 0, number + 1)
+        put(hits, 3 * number, worth)
+        put(hits, 3 * number + 1, a)
+        put(hits, 3 * number + 2, passed)
+        put(chain, 2 * number, entry)
+        put(chain, 2 * number + 1, get(last, pixel))
+        put(last, pixel, number)
     elif channels > 0:
         w = passed * a
         y0, y1 = y0 * w, y1 * w
         _blend(sums, pixel * channels, features, i00, i01, i10, i11, y0 * x0, y0 * x1, y1 * x0, y1 * x1, channels)
-    through[pixel] = passed * (one - a)
+    put(through, pixel, passed * (one - a))
 
 
 @kernel
-def traverse(turn, tiles, start, members, offset, record, box, place, features, alpha, limits, shape, image, opacity,
-             grads, notes, base, real, whole, status):  # fmt: skip
+def traverse(turn, tiles, start, members_, offset_, record_, box, place_, features_, alpha_, limits_, shape, image,
+             opacity, grads_, notes_, base, real, whole, status):  # fmt: skip
     """Works through tiles until none is left: blends them, or notes what `collect` needs.
 
     Args:
@@ -183,19 +187,21 @@ def traverse(turn, tiles, start, members, offset, record, box, place, features, 
     texels, channels, width, height, across, depth, capacity, rows, replay = (
         shape[0], shape[1], shape[2], shape[3], shape[4], shape[5], shape[6], shape[7], shape[8] != 0,
     )  # fmt: skip
-    zero, one, t_min = limits[0], limits[1], limits[6]
+    members, offset, record, place = (
+        pointer(members_, 0), pointer(offset_, 0), pointer(record_, 0), pointer(place_, 0),
+    )  # fmt: skip
+    features, alpha, limits = pointer(features_, 0), pointer(alpha_, 0), pointer(limits_, 0)
+    grads, notes = pointer(grads_, 0), pointer(notes_, 0)
+    zero, one, t_min = get(limits, 0), get(limits, 1), get(limits, 6)
     band = TILE_WIDTH * rows
     # Scratch: what a row of pixels found, transmittances, sums of colour, queues; then the replay's hits.
-    found, through = real[: 4 * LANES], real[4 * LANES : 4 * LANES + band + LANES]
-    at = 4 * LANES + band + LANES
-    sums = real[at : at + band * channels]
-    at += band * channels
-    queue = real[at : at + 4 * band * capacity]
-    hits = real[at + 4 * band * capacity :]
-    head, tail, last = whole[:band], whole[band : 2 * band], whole[2 * band : 3 * band]
-    who = whole[3 * band : 3 * band + band * capacity]
-    counts = whole[3 * band + band * capacity : 3 * band + band * capacity + 1]
-    chain = whole[3 * band + band * capacity + 1 :]
+    found, through = pointer(real, 0), pointer(real, 4 * LANES)
+    at = 5 * LANES + band
+    sums, queue = pointer(real, at), pointer(real, at + band * channels)
+    hits = pointer(real, at + band * channels + 4 * band * capacity)
+    head, tail, last = pointer(whole, 0), pointer(whole, band), pointer(whole, 2 * band)
+    who, counts = pointer(whole, 3 * band), pointer(whole, 3 * band + band * capacity)
+    chain = pointer(whole, 3 * band + band * capacity + 1)
     while True:
         position = fetch_add(turn, 1)
         if position >= len(tiles):
@@ -204,31 +210,33 @@ def traverse(turn, tiles, start, members, offset, record, box, place, features, 
         left, tile_top = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
         right, tile_bottom = min(left + TILE_WIDTH, width), min(tile_top + TILE_HEIGHT, height)
         if replay:
-            for i in range(2 * (offset[start[tile]] - base), 2 * (offset[start[tile + 1]] - base)):
-                notes[i] = zero
+            for i in range(2 * (get(offset, start[tile]) - base), 2 * (get(offset, start[tile + 1]) - base)):
+                put(notes, i, zero)
         overflow = False
         for top in range(tile_top, tile_bottom, rows):
             bottom = min(top + rows, tile_bottom)
             for i in range(band):
-                through[i] = zero
-                head[i], tail[i], last[i] = 0, 0, -1
+                put(through, i, zero)
+                put(head, i, 0)
+                put(tail, i, 0)
+                put(last, i, -1)
             for y in range(top, bottom):
                 for x in range(left, right):
-                    through[(y - top) * TILE_WIDTH + x - left] = one
+                    put(through, (y - top) * TILE_WIDTH + x - left, one)
             for i in range(band * channels):
-                sums[i] = zero
-            counts[0] = 0
+                put(sums, i, zero)
+            put(counts, 0, 0)
             active = (bottom - top) * (right - left)
             for entry in range(start[tile], start[tile + 1]):
-                i = members[entry]
+                i = get(members, entry)
                 x_first, x_end = max(left, box[i, 0]), min(right, box[i, 2])
                 y_first, y_end = max(top, box[i, 1]), min(bottom, box[i, 3])
                 if y_first >= y_end:
                     continue
                 r = i * RECORD
                 x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
-                fade, reach = record[r + 10], record[r + 11]
-                own_place = place[i]
+                fade, reach = get(record, r + 10), get(record, r + 11)
+                own_place = get(place, i)
                 for y in range(y_first, y_end):
                     dy = zero + np.float32(y - y_origin)
                     for x_start in range(x_first, x_end, LANES):
@@ -243,61 +251,61 @@ def traverse(turn, tiles, start, members, offset, record, box, place, features, 
                             lane = count_trailing_zeros(mask)
                             mask &= mask - 1
                             pixel = row_start + lane
-                            key = found[2 * LANES + lane]
-                            a = fade * found[3 * LANES + lane]
+                            key = get(found, 2 * LANES + lane)
+                            a = fade * get(found, 3 * LANES + lane)
                             slots = pixel * capacity
                             grad_at = ((y * width) + x_start + lane) * (channels + 1)
-                            begin, end = head[pixel], tail[pixel]
+                            begin, end = get(head, pixel), get(tail, pixel)
                             if depth < 0:
-                                while begin < end and queue[4 * (slots + begin) + 2] >= reach:
-                                    _release(pixel, 4 * (slots + begin), members[who[slots + begin]], queue, through,
+                                while begin < end and get(queue, 4 * (slots + begin) + 2) >= reach:
+                                    _release(pixel, 4 * (slots + begin), get(members, get(who, slots + begin)), queue, through,
                                              sums, features, grads, grad_at, hits, chain, last, counts,
-                                             who[slots + begin], limits, texels, channels, replay)  # fmt: skip
+                                             get(who, slots + begin), limits, texels, channels, replay)  # fmt: skip
                                     begin += 1
-                                    if through[pixel] < t_min:
+                                    if get(through, pixel) < t_min:
                                         begin = end
                                         active -= 1
                                 if begin == end:
                                     begin, end = 0, 0
-                                    if through[pixel] < t_min:
-                                        head[pixel], tail[pixel] = 0, 0
+                                    if get(through, pixel) < t_min:
+                                        put(head, pixel, 0)
+                                        put(tail, pixel, 0)
                                         continue
                             if end == capacity:
                                 if begin == 0:
                                     overflow = True
                                     break
                                 for j in range(begin, end):
-                                    for k in range(4):
-                                        queue[4 * (slots + j - begin) + k] = queue[4 * (slots + j) + k]
-                                    who[slots + j - begin] = who[slots + j]
+                                    move4(queue, 4 * (slots + j - begin), 4 * (slots + j))
+                                    put(who, slots + j - begin, get(who, slots + j))
                                 begin, end = 0, end - begin
                             j = end
                             if depth != 0:
                                 while j > begin:
-                                    other = queue[4 * (slots + j - 1) + 2]
-                                    if other > key or (other == key and place[members[who[slots + j - 1]]] < own_place):
+                                    other = get(queue, 4 * (slots + j - 1) + 2)
+                                    if other > key or (other == key and get(place, get(members, get(who, slots + j - 1))) < own_place):
                                         break
-                                    for k in range(4):
-                                        queue[4 * (slots + j) + k] = queue[4 * (slots + j - 1) + k]
-                                    who[slots + j] = who[slots + j - 1]
+                                    move4(queue, 4 * (slots + j), 4 * (slots + j - 1))
+                                    put(who, slots + j, get(who, slots + j - 1))
                                     j -= 1
-                            queue[4 * (slots + j)] = found[lane]
-                            queue[4 * (slots + j) + 1] = found[LANES + lane]
-                            queue[4 * (slots + j) + 2] = key
-                            queue[4 * (slots + j) + 3] = a
-                            who[slots + j] = entry
+                            put(queue, 4 * (slots + j), get(found, lane))
+                            put(queue, 4 * (slots + j) + 1, get(found, LANES + lane))
+                            put(queue, 4 * (slots + j) + 2, key)
+                            put(queue, 4 * (slots + j) + 3, a)
+                            put(who, slots + j, entry)
                             end += 1
                             if depth >= 0 and end - begin > depth:
-                                _release(pixel, 4 * (slots + begin), members[who[slots + begin]], queue, through, sums,
-                                         features, grads, grad_at, hits, chain, last, counts, who[slots + begin],
+                                _release(pixel, 4 * (slots + begin), get(members, get(who, slots + begin)), queue, through, sums,
+                                         features, grads, grad_at, hits, chain, last, counts, get(who, slots + begin),
                                          limits, texels, channels, replay)  # fmt: skip
                                 begin += 1
-                                if through[pixel] < t_min:
+                                if get(through, pixel) < t_min:
                                     begin = end
                                     active -= 1
                                 if begin == end:
                                     begin, end = 0, 0
-                            head[pixel], tail[pixel] = begin, end
+                            put(head, pixel, begin)
+                            put(tail, pixel, end)
                         if overflow:
                             break
                     if overflow:
@@ -310,47 +318,47 @@ def traverse(turn, tiles, start, members, offset, record, box, place, features, 
                 for x in range(left, right):
                     pixel = (y - top) * TILE_WIDTH + x - left
                     slots = pixel * capacity
-                    for j in range(head[pixel], tail[pixel]):
-                        if through[pixel] < t_min:
+                    for j in range(get(head, pixel), get(tail, pixel)):
+                        if get(through, pixel) < t_min:
                             break
-                        _release(pixel, 4 * (slots + j), members[who[slots + j]], queue, through, sums, features, grads,
-                                 (y * width + x) * (channels + 1), hits, chain, last, counts, who[slots + j], limits,
+                        _release(pixel, 4 * (slots + j), get(members, get(who, slots + j)), queue, through, sums, features, grads,
+                                 (y * width + x) * (channels + 1), hits, chain, last, counts, get(who, slots + j), limits,
                                  texels, channels, replay)  # fmt: skip
             if replay:
                 for y in range(top, bottom):
                     for x in range(left, right):
-                        number = last[(y - top) * TILE_WIDTH + x - left]
+                        number = get(last, (y - top) * TILE_WIDTH + x - left)
                         behind = zero
                         while number >= 0:
-                            worth, a, passed = hits[3 * number], hits[3 * number + 1], hits[3 * number + 2]
-                            entry = chain[2 * number]
-                            i = members[entry]
+                            worth, a, passed = get(hits, 3 * number), get(hits, 3 * number + 1), get(hits, 3 * number + 2)
+                            entry = get(chain, 2 * number)
+                            i = get(members, entry)
                             x_first, x_end = max(left, box[i, 0]), min(right, box[i, 2])
                             y_first = max(tile_top, box[i, 1])
-                            spot = 2 * (offset[entry] - base + (y - y_first) * (x_end - x_first) + x - x_first)
-                            notes[spot] = passed * a
-                            notes[spot + 1] = passed * (worth - behind)
+                            spot = 2 * (get(offset, entry) - base + (y - y_first) * (x_end - x_first) + x - x_first)
+                            put(notes, spot, passed * a)
+                            put(notes, spot + 1, passed * (worth - behind))
                             behind = a * worth + (one - a) * behind
-                            number = chain[2 * number + 1]
-                status[2] += counts[0]
+                            number = get(chain, 2 * number + 1)
+                status[2] += get(counts, 0)
             else:
                 for c in range(channels):
                     for y in range(top, bottom):
                         for x in range(left, right):
                             pixel = (y - top) * TILE_WIDTH + x - left
-                            image[c, y, x] = sums[pixel * channels + c]
+                            image[c, y, x] = get(sums, pixel * channels + c)
                 for y in range(top, bottom):
                     for x in range(left, right):
-                        opacity[y, x] = one - through[(y - top) * TILE_WIDTH + x - left]
+                        opacity[y, x] = one - get(through, (y - top) * TILE_WIDTH + x - left)
         if overflow:
             status[3 + status[0]] = tile
             status[0] += 1
 
 
 @kernel
-def collect(turn, chunk, first_tile, end_tile, sequence, first, tile, where, start, offset, record, box, features,
-            alpha, limits, shape, grads, notes, base, fresh,
-            grad_features, grad_alpha, grad_plane, grad_fade):  # fmt: skip
+def collect(turn, chunk, first_tile, end_tile, sequence, first, tile, where, start, offset, record_, box, features_,
+            alpha_, limits, shape, grads_, notes_, base, fresh, grad_features_, grad_alpha_, grad_plane,
+            grad_fade):  # fmt: skip
     """Gathers the noted hits of tiles `first_tile ... end_tile` into the gradients, billboard by billboard.
 
     Args:
@@ -362,6 +370,9 @@ def collect(turn, chunk, first_tile, end_tile, sequence, first, tile, where, sta
     """
     texels, channels, width, across = shape[0], shape[1], shape[2], shape[4]
     zero, one, size, step, alpha_max = limits[0], limits[1], limits[2], limits[3], limits[7]
+    record, features, alpha = pointer(record_, 0), pointer(features_, 0), pointer(alpha_, 0)
+    grads, notes = pointer(grads_, 0), pointer(notes_, 0)
+    grad_features, grad_alpha = pointer(grad_features_, 0), pointer(grad_alpha_, 0)
     area = texels * texels
     scale = 0.5 * (texels - 1) if texels > 1 else 1.0
     shift = 0.5 * (texels - 1)
@@ -374,10 +385,10 @@ def collect(turn, chunk, first_tile, end_tile, sequence, first, tile, where, sta
             r = i * RECORD
             if fresh:
                 for j in range(np.int64(i) * area * channels, (np.int64(i) + 1) * area * channels):
-                    grad_features[j] = zero
+                    put(grad_features, j, zero)
                 for j in range(np.int64(i) * area, (np.int64(i) + 1) * area):
-                    grad_alpha[j] = zero
-            fade = record[r + 10]
+                    put(grad_alpha, j, zero)
+            fade = get(record, r + 10)
             x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
             g_fade = 0.0
             s_x, s_y, s_1, t_x, t_y, t_1, w_x, w_y, w_1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -391,14 +402,14 @@ def collect(turn, chunk, first_tile, end_tile, sequence, first, tile, where, sta
                 for y in range(y_first, y_end):
                     dy = zero + np.float32(y - y_origin)
                     for x in range(x_first, x_end):
-                        w, by_a = notes[spot], notes[spot + 1]
+                        w, by_a = get(notes, spot), get(notes, spot + 1)
                         spot += 2
                         if w == zero and by_a == zero:
                             continue
                         dx = zero + np.float32(x - x_origin)
-                        p = one / affine(record[r + 6], record[r + 7], record[r + 8], dx, dy)
-                        s = affine(record[r], record[r + 1], record[r + 2], dx, dy) * p
-                        t = affine(record[r + 3], record[r + 4], record[r + 5], dx, dy) * p
+                        p = one / affine(get(record, r + 6), get(record, r + 7), get(record, r + 8), dx, dy)
+                        s = affine(get(record, r), get(record, r + 1), get(record, r + 2), dx, dy) * p
+                        t = affine(get(record, r + 3), get(record, r + 4), get(record, r + 5), dx, dy) * p
                         column, row = first_texel(s, size, zero, one), first_texel(t, size, zero, one)
                         x0, x1 = weights(s, column, step, zero, one)
                         y0, y1 = weights(t, row, step, zero, one)
@@ -407,7 +418,7 @@ def collect(turn, chunk, first_tile, end_tile, sequence, first, tile, where, sta
                         i00 = np.int64(i) * area + np.int64(row) * texels + np.int64(column)
                         right, below = np.int64(step), np.int64(step) * texels
                         i01, i10, i11 = i00 + right, i00 + below, i00 + right + below
-                        t00, t01, t10, t11 = alpha[i00], alpha[i01], alpha[i10], alpha[i11]
+                        t00, t01, t10, t11 = get(alpha, i00), get(alpha, i01), get(alpha, i10), get(alpha, i11)
                         sample = mix(t00, t01, t10, t11, x0, x1, y0, y1)
                         by_s, by_t = zero, zero
                         if fade * sample <= alpha_max:  # a capped alpha does not move
@@ -415,10 +426,10 @@ def collect(turn, chunk, first_tile, end_tile, sequence, first, tile, where, sta
                             by_a = by_a * fade
                             by_s = by_a * mix(t00, t01, t10, t11, a0, a1, y0, y1)
                             by_t = by_a * mix(t00, t01, t10, t11, x0, x1, b0, b1)
-                            grad_alpha[i00] += by_a * y0 * x0
-                            grad_alpha[i01] += by_a * y0 * x1
-                            grad_alpha[i10] += by_a * y1 * x0
-                            grad_alpha[i11] += by_a * y1 * x1
+                            put(grad_alpha, i00, get(grad_alpha, i00) + by_a * y0 * x0)
+                            put(grad_alpha, i01, get(grad_alpha, i01) + by_a * y0 * x1)
+                            put(grad_alpha, i10, get(grad_alpha, i10) + by_a * y1 * x0)
+                            put(grad_alpha, i11, get(grad_alpha, i11) + by_a * y1 * x1)
                         if channels > 0:
                             at = (np.int64(y) * width + x) * (channels + 1)
                             i00, i01, i10, i11 = i00 * channels, i01 * channels, i10 * channels, i11 * channels

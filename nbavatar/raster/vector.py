@@ -109,10 +109,6 @@ def _store(builder: ir.IRBuilder, value: Any, base: Any, index: Any, element: ir
     builder.store(value, _pointer(builder, base, index, element, count), align=size)
 
 
-def _data(context: Any, builder: ir.IRBuilder, kind: Any, value: Any) -> Any:
-    return context.make_array(kind)(context, builder, value).data
-
-
 def _sum(builder: ir.IRBuilder, value: Any) -> Any:
     """Sum of a vector's elements, pairwise, so that its order is fixed."""
     count = value.type.count
@@ -161,11 +157,10 @@ def evaluate_row(
     element = coefficients.dtype
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
-        kinds = signature.args
         (_, at_, x_, y_, count_, _, base_, texels_, _, _, pixel_, _) = args
-        records, alphas = _data(context, builder, kinds[0], args[0]), _data(context, builder, kinds[5], args[5])
-        bounds, passing = _data(context, builder, kinds[8], args[8]), _data(context, builder, kinds[9], args[9])
-        results = _data(context, builder, kinds[11], args[11])
+        records, alphas = args[0], args[5]
+        bounds, passing = args[8], args[9]
+        results = args[11]
         number = context.get_value_type(element)
         index = at_.type
 
@@ -204,7 +199,7 @@ def evaluate_row(
         def gather(offset: Any) -> Lanes:
             value: Any = ir.Constant(ir.VectorType(number, LANES), ir.Undefined)
             for i in range(LANES):
-                where = builder.sext(builder.extract_element(offset, ir.Constant(_I32, i)), index)
+                where = builder.zext(builder.extract_element(offset, ir.Constant(_I32, i)), index)
                 texel = builder.load(builder.gep(texture, [where]))
                 value = builder.insert_element(value, texel, ir.Constant(_I32, i))
             return Lanes(builder, value)
@@ -245,8 +240,8 @@ def make_blend(count: int) -> Any:
               w01: Any, w10: Any, w11: Any) -> Any:  # fmt: skip
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
             number = context.get_value_type(sums.dtype)
-            total_at = _data(context, builder, signature.args[0], args[0])
-            texture = _data(context, builder, signature.args[2], args[2])
+            total_at = args[0]
+            texture = args[2]
             texels = _corner_lanes(context, builder, texture, args[3:7], number, count)
             total = Lanes(builder, _load(builder, total_at, args[1], number, count))
             for texel, weight in zip(texels, args[7:11], strict=True):
@@ -268,11 +263,11 @@ def make_dot(count: int) -> Any:
             w01: Any, w10: Any, w11: Any) -> Any:  # fmt: skip
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
             number = context.get_value_type(grads.dtype)
-            texture = _data(context, builder, signature.args[2], args[2])
+            texture = args[2]
             texels = _corner_lanes(context, builder, texture, args[3:7], number, count)
             parts = [t * Lanes(builder, _splat(builder, w, count)) for t, w in zip(texels, args[7:11], strict=True)]
             colour = (parts[0] + parts[1]) + (parts[2] + parts[3])
-            grad_at = _data(context, builder, signature.args[0], args[0])
+            grad_at = args[0]
             grad = Lanes(builder, _load(builder, grad_at, args[1], number, count))
             return _sum(builder, (colour * grad).value)
 
@@ -296,9 +291,9 @@ def make_slopes(count: int) -> Any:
 
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
             number = context.get_value_type(grads.dtype)
-            texture = _data(context, builder, signature.args[2], args[2])
+            texture = args[2]
             texels = _corner_lanes(context, builder, texture, args[3:7], number, count)
-            grad_at = _data(context, builder, signature.args[0], args[0])
+            grad_at = args[0]
             grad = Lanes(builder, _load(builder, grad_at, args[1], number, count))
             a0, a1, b0, b1, c0, c1, d0, d1 = (Lanes(builder, _splat(builder, value, count)) for value in args[7:15])
             by_s = _ROW.mix(*texels, c0, c1, b0, b1) * grad
@@ -318,8 +313,8 @@ def make_scatter(count: int) -> Any:
                 w11: Any, grads: Any, at: Any) -> Any:  # fmt: skip
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
             number = context.get_value_type(totals.dtype)
-            total_at = _data(context, builder, signature.args[0], args[0])
-            grad_at = _data(context, builder, signature.args[9], args[9])
+            total_at = args[0]
+            grad_at = args[9]
             grad = Lanes(builder, _load(builder, grad_at, args[10], number, count))
             # one after the other: of a single-texel texture all four are the same place
             for index, weight in zip(args[1:5], args[5:9], strict=True):
