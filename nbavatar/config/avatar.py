@@ -95,7 +95,7 @@ class TrainConfig:
     roi: bool = option(True, "Decode only a window around the avatar.")
     roi_margin: float = option(0.15, "Margin of that window, in its own size (hair has no mesh).", min=0)
     order: str = option("ray", "Compositing order of the rasterizer: ray, kbuffer(n) or center.")
-    precision: str = option("fp32", "Arithmetic of the U-Net (autocast).", choices=_PRECISIONS)
+    precision: str = option("fp32", "Arithmetic of the U-Net (autocast).", choices=("fp32", "bf16"))
     max_bad_steps: int = option(20, "Non-finite steps in a row before training stops.", min=1)
     previews: int = option(6, "Preview pictures over the whole training.", min=0)
     checkpoint_seconds: float = option(60.0, "Time between checkpoints [s].", min=0)
