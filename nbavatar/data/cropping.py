@@ -120,7 +120,7 @@ def frame_boxes(
 
 
 def _named(frames: Sequence[str], chosen: np.ndarray) -> list[str]:
-    return [frames[i] for i in np.flatnonzero(chosen)]
+    return [frames[int(i)] for i in np.flatnonzero(chosen)]
 
 
 def crop_extent(plan: CropPlan, camera: Camera) -> Mapping[str, float]:
