@@ -136,7 +136,7 @@ def to_strip(comparison: Comparison, *, max_side: int) -> Strip:
             for row in ROWS
             if row in column.pictures
         ]
-        caption = _figures(column.figures) or ("whole, zoom at the contact, coverage" if frame else "")
+        caption = _figures(column.figures) or ("whole, zoom, coverage" if frame else "")
         cards.append(Card(column.title, pictures, caption, max(height, width) <= 128, frame))
     return Strip(where, cards)
 

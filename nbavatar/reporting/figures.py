@@ -64,16 +64,25 @@ def curves_figure(curves: Sequence[Curve]) -> "Figure":
         for number, (name, points) in enumerate(curve.series.items()):
             style = ("-", "--", ":", "-.")[number // len(PALETTE) % 4]
             colour = PALETTE[number % len(PALETTE)]
-            marker = "o" if len(points) == 1 else ""
-            if points:
-                xs, ys = zip(*points, strict=True)
-                axis.plot(xs, ys, style, color=colour, linewidth=1.2, marker=marker, markersize=3, label=name)
-        if curve.log_y and any(y > 0 for points in curve.series.values() for _, y in points):
+            shown = [(x, y) for x, y in points if y > 0 or not curve.log_y]
+            if shown:
+                xs, ys = zip(*shown, strict=True)
+                axis.plot(
+                    xs,
+                    ys,
+                    style,
+                    color=colour,
+                    linewidth=1.2,
+                    marker="o" if len(shown) == 1 else "",
+                    markersize=3,
+                    label=name,
+                )
+        if curve.log_y and axis.has_data():
             axis.set_yscale("log")
         axis.set_title(curve.title, fontsize=9)
         axis.set_xlabel("step", fontsize=8)
         axis.set_ylabel(curve.y_label, fontsize=8)
-        axis.tick_params(labelsize=7)
+        axis.tick_params(which="both", labelsize=7)
         axis.grid(linewidth=0.4, alpha=0.6)
         axis.spines[["top", "right"]].set_visible(False)
     handles, names = axes[0].get_legend_handles_labels()
