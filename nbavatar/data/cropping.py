@@ -119,7 +119,7 @@ def frame_boxes(
     return boxes, "tracked boxes", _named(frames, lost)
 
 
-def _named(frames: Sequence[str], chosen: np.ndarray) -> list[str]:
+def _named(frames: Sequence[str], chosen: Sequence[bool] | np.ndarray | np.bool) -> list[str]:
     return [frames[int(i)] for i in np.flatnonzero(chosen)]
 
 
