@@ -39,11 +39,15 @@ class FitConfig:
     smooth_expression: float = option(
         0.5, "Typical acceleration of expression coefficients, 0 for none [1 / frame^2].", min=0.0
     )
-    silhouette_weight: float = option(0.05, "Weight of a contour point against a keypoint; 0 leaves masks alone.", min=0.0)
-    silhouette_frames: int = option(24, "Frames whose masks are used, spread over the sequence.", min=1)
+    silhouette_weight: float = option(
+        0.05, "Weight of a contour point against a keypoint; 0 leaves masks alone.", min=0.0, max=10.0
+    )
+    silhouette_frames: int = option(12, "Frames whose masks are used, spread over the sequence.", min=1)
     silhouette_lines: int = option(270, "Height that masks are reduced to [px].", min=16, max=2160)
-    silhouette_band_px: float = option(20.0, "How far contours are drawn to a border [px at 1080 image lines].", min=0.0)
-    silhouette_deviation_px: float = option(2.0, "Typical error of a mask's border [px at 1080 image lines].", min=0.01)
+    silhouette_band_px: float = option(
+        20.0, "How far contours are drawn to the border of a mask [px at 1080 image lines].", min=0.0
+    )
+    silhouette_deviation_px: float = option(2.0, "Error of a mask's border [px at 1080 image lines].", min=0.01)
     check_handedness: bool = option(True, "Whether to try the other hand's model too, and report which fits.")
     sheet_frames: int = option(4, "Frames on the contact sheet.", min=1, max=64)
     sheet_cameras: int = option(4, "Cameras on the contact sheet.", min=1, max=16)
@@ -76,7 +80,7 @@ class DeformConfig:
         min=0.0, max=1.0e12,
     )  # fmt: skip
     bending: float = option(1.0e-5, "Flexural rigidity of the skin [N m].", min=0.0, max=1.0e12)
-    volume: float = option(0.0, "Resistance of the pressed region to loss of volume [N/m^5].", min=0.0, max=1.0e18)
+    volume: float = option(5.0e8, "Resistance of the pressed region to loss of volume [N/m^5].", min=0.0, max=1.0e18)
     friction: float = option(0.3, "Coulomb friction of a hand on skin.", min=0.0, max=10.0)
     reach: float = option(0.05, "How far from a contact the skin moves, along the surface [m].", min=0.0, max=1.0)
     max_dent: float = option(0.035, "Longest way a point of the skin may move [m].", min=0.0, max=1.0)

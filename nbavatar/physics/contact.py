@@ -32,7 +32,7 @@ class ContactNumbers:
     stretch: float = 30.0  # of an edge [N/m]
     shear: float = 300.0  # of the layer of fat, by which neighbours move along [N/m]
     bending: float = 1e-5  # flexural rigidity of the skin [N m]
-    volume: float = 0.0  # resistance to loss of volume [N/m^5]
+    volume: float = 5e8  # resistance to loss of volume [N/m^5]
     friction: float = 0.3
     density: float = 10.0  # of moving tissue, per area [kg/m^2]
     reach: float = 0.05  # how far from a contact the skin moves, along the surface [m]
@@ -136,7 +136,9 @@ class ContactSolver:
         x = head + dent
         old = np.abs(dent).max(axis=1) > 1e-6
         touched = np.zeros(self._count, bool)
-        active = np.zeros(0, np.int64)
+        # What was dented in the frame before springs back, touched or not.
+        active = np.flatnonzero(old)
+        local = self._local(active, head)
         last = [self._posed(s, pose[k], centre[k]) for k, s in enumerate(start)]
         total = path + n.settle
         done = 0
