@@ -56,28 +56,43 @@ def _meshes() -> tuple[Tensor, Tensor, int]:
 
 
 def make_scene(
-    *, size: int = 1024, billboards: int | None = None, channels: int = 6, texels: int = 16, seed: int = 0
+    *,
+    size: int = 1024,
+    billboards: int | None = None,
+    channels: int = 6,
+    texels: int = 16,
+    state: str = "trained",
+    seed: int = 0,
 ) -> RasterScene:
     """Builds the scene.
 
-    One billboard a face (11,514 of FLAME and MANO) in the state in which training starts: opacity a
-    Gaussian of peak 0.9 and deviation 0.5, half-extents 1.5 boxes around the triangle; features are
-    random. Another number of billboards is spread over the same surface, each as large as its share of
-    it asks. The camera looks at the face from 0.8 m and the head fills 85 % of the height.
+    One billboard a face (11,514 of FLAME and MANO); features are random. In the state `initial` training
+    starts: opacity a Gaussian of peak 0.9 and deviation 0.5, half-extents 1.5 boxes around the triangle,
+    two dozen layers on a pixel. The state `trained` stands in for an avatar whose surface has closed:
+    half-extents of 1.1 boxes, opacity 0.95 inside that falls off towards the border. Another number of
+    billboards is spread over the same surface, each as large as its share of it asks. The camera looks at
+    the face from 0.8 m and the head fills 85 % of the height.
 
     Args:
         size: image side [px].
         billboards: F, or None for one a face.
         channels: C.
         texels: T.
+        state: `trained` or `initial`.
         seed: of the features and of the spreading.
     """
     verts, faces, head_count = _meshes()
     generator = torch.Generator().manual_seed(seed)
     frames = face_frames(verts, faces)
-    extents = initial_half_extents(verts, faces, frames, margin=1.5)
+    extents = initial_half_extents(verts, faces, frames, margin=1.5 if state == "initial" else 1.1)
     count = len(faces) if billboards is None else billboards
-    logits = gaussian_alpha_logits(texels, sigma=0.5, peak=0.9, floor=0.005).expand(count, texels, texels)
+    if state == "initial":
+        logits = gaussian_alpha_logits(texels, sigma=0.5, peak=0.9, floor=0.005)
+    else:
+        axis = torch.linspace(-1, 1, texels) if texels > 1 else torch.zeros(1)
+        radius = (axis[:, None] ** 4 + axis**4) ** 0.25
+        logits = torch.logit((0.95 * torch.sigmoid(16.0 * (0.75 - radius))).clamp_min(1e-4))
+    logits = logits.expand(count, texels, texels)
     features = torch.rand(count, texels, texels, channels, generator=generator)
     if count == len(faces):
         model = Billboards(extents, features, logits)
