@@ -78,7 +78,8 @@ def read_results(paths: list[str]) -> list[Result]:
             raise DataError.of(path, expected="a result of nbavatar evaluate or speed", found="another JSON file")
         content = {"subject": Path(path).parent.name, "variant": Path(path).stem} | content
         size = content.get("size") or content.get("speed", {}).get("size")
-        source = Source(path, file_digest(path), content.get("protocol_hash", ""), tuple(size) if size else None)
+        pixels = (int(size[0]), int(size[1])) if size else None
+        source = Source(path, file_digest(path), content.get("protocol_hash", ""), pixels)
         results.append((content, source))
     return results
 
