@@ -6,8 +6,8 @@ Reads
              exist parameters param.<part>.<name> to start from; without any, the start is triangulated
   --assets   folder with generic_model.pkl (FLAME), landmark_embedding.npy and mano_v1_2/models/MANO_RIGHT.pkl
              (MANO_LEFT.pkl); a missing side is the mirror image of the other
-  --frames   frame packs (.zip, `nbavatar ingest`) of the cameras to use, also drawn on the sheet; without them all
-             cameras with keypoints are used
+  --frames   frame packs (.zip, `nbavatar ingest`) of the cameras to use, drawn on the sheet; their masks (layer label,
+             or person) bound the contours of the meshes; without packs all cameras with keypoints are used
 and writes
   --out      mesh sequence with fitted meshes and parameters; extras reprojection.<part>.{before, after} [M, 4]
              (median and 95th percentile [px], share unexplained, count), convergence.<part> [I, 4],
@@ -23,6 +23,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from nbavatar.bodymodels.files import read_flame, read_landmarks, read_mano
@@ -34,7 +35,7 @@ from nbavatar.config.geometry import FitConfig
 from nbavatar.data.sequences import MeshSequence, read_sequence, write_sequence
 from nbavatar.errors import DataError
 from nbavatar.fitting.pictures import contact_sheet
-from nbavatar.fitting.stage import Bodies, fit_sequence
+from nbavatar.fitting.stage import Bodies, Masks, fit_sequence
 from nbavatar.io.arrays import read_arrays
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
@@ -42,6 +43,8 @@ from nbavatar.io.images import encode_png
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
+
+_MATTE_THRESHOLD = 127
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,8 +68,9 @@ def main(args: argparse.Namespace) -> None:
             pack = stack.enter_context(FramePack(path))
             packs[str(pack.manifest["camera"])] = pack
         fitted, report = fit_sequence(
-            tracks.frames, tracks.parts, tracks.extras, bodies, cfg, cameras=list(packs) or None, progress=_progress
-        )
+            tracks.frames, tracks.parts, tracks.extras, bodies, cfg, cameras=list(packs) or None,
+            masks=_read_masks(packs, tracks.frames, cfg), progress=_progress,
+        )  # fmt: skip
         options = {"frames": cfg.sheet_frames, "cameras": cfg.sheet_cameras, "tile": cfg.sheet_tile}
         sheet = contact_sheet(fitted, packs, **options) if args.sheet else None
     for part, summary in report.items():
@@ -114,6 +118,22 @@ def _read_bodies(assets: Path, extras: dict[str, Any]) -> tuple[Bodies, dict[str
             hands[side] = Mano.build(arrays, side, dtype=torch.float64)
         files |= {f"mano_{side}": path for side, path in found.items()}
     return Bodies(head, hands), files
+
+
+def _read_masks(packs: dict[str, FramePack], frames: list[str], cfg: FitConfig) -> Masks | None:
+    """Masks of some frames that all packs have: labels of head and hands where there are any, else person mattes."""
+    layers = [layer for layer in ("label", "person") if packs and all(layer in pack.layers for pack in packs.values())]
+    common = [i for i, frame in enumerate(frames) if all(frame in pack.frames for pack in packs.values())]
+    if cfg.silhouette_weight == 0 or not layers or not common:
+        return None
+    spread = np.linspace(0, len(common) - 1, min(cfg.silhouette_frames, len(common))).round().astype(int)
+    chosen = [common[i] for i in spread]
+    labels, layer = layers[0] == "label", layers[0]
+    images = {
+        camera: np.stack([pack.read(layer, frames[i]) > (0 if labels else _MATTE_THRESHOLD) for i in chosen])
+        for camera, pack in packs.items()
+    }
+    return Masks(chosen, images, labels)
 
 
 def _progress(part: str, step: Any) -> None:

@@ -11,12 +11,15 @@ Everything is float64.
 """
 
 import dataclasses
+import functools
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from nbavatar.bodymodels.flame import Flame, Landmarks
+from nbavatar.bodymodels.lbs import SkinnedMesh
 from nbavatar.bodymodels.mano import TIP_PAIRS, Mano
 from nbavatar.fitting.points import SkinnedPoints, concatenate, skew, skinned_points
 from nbavatar.math.rotations import axis_angle_to_matrix, matrix_to_axis_angle
@@ -25,6 +28,7 @@ __all__ = ["HandPart", "HeadPart", "Keypoints", "PartModel", "State", "retract",
 
 HAND_TIP_RATIO = 0.7
 _JAW = 2
+_SAMPLES = 200
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +58,15 @@ class PartModel(Protocol):
 
     local_count: int
     shape_count: int
+    faces: np.ndarray
+    samples: Tensor
 
     def keypoints(self, state: State) -> Keypoints:
         """Keypoints of all frames of `state`, with derivatives."""
+        ...
+
+    def surface(self, state: State) -> Keypoints:
+        """Sample vertices of the surface, with derivatives."""
         ...
 
     def vertices(self, state: State) -> Tensor:
@@ -82,10 +92,15 @@ class HeadPart:
         count = flame.mesh.template.shape[0]
         everything = torch.arange(count)[None]
         uniform = torch.full((1, count), 1 / count, dtype=flame.mesh.template.dtype)
-        self._points = concatenate(
-            skinned_points(flame.mesh, landmarks.vertices, landmarks.weights.to(uniform.dtype), (_JAW,)),
-            skinned_points(flame.mesh, everything, uniform, (_JAW,)),
-        )
+        centroid = skinned_points(flame.mesh, everything, uniform, (_JAW,))
+        weights = landmarks.weights.to(uniform.dtype)
+        self._points = concatenate(skinned_points(flame.mesh, landmarks.vertices, weights, (_JAW,)), centroid)
+        self.faces, self.samples = flame.faces, _spread(count)
+        self._centroid = centroid
+
+    @functools.cached_property
+    def _surface(self) -> SkinnedPoints:
+        return concatenate(_vertices(self.flame.mesh, self.samples, (_JAW,)), self._centroid)
 
     @classmethod
     def state(cls, shape: Tensor, expression: Tensor, jaw: Tensor, global_orient: Tensor, transl: Tensor) -> State:
@@ -94,9 +109,16 @@ class HeadPart:
 
     def keypoints(self, state: State) -> Keypoints:
         """68 landmarks."""
+        return self._pose(self._points, state)
+
+    def surface(self, state: State) -> Keypoints:
+        """Sample vertices."""
+        return self._pose(self._surface, state)
+
+    def _pose(self, which: SkinnedPoints, state: State) -> Keypoints:
         jaw, expression = state.local[:, :3], state.local[:, 3:]
         coefficients = torch.cat([state.shape.expand(len(jaw), -1), expression], 1)
-        points, by_shape, by_turn = self._points.pose(coefficients, axis_angle_to_matrix(jaw)[:, None])
+        points, by_shape, by_turn = which.pose(coefficients, axis_angle_to_matrix(jaw)[:, None])
         by_jaw = by_turn @ right_jacobian(jaw)[:, None]
         by_local = torch.cat([by_jaw, by_shape[..., self.shape_count :]], -1)
         return _rigid(points, by_local, by_shape[..., : self.shape_count], state)
@@ -142,6 +164,11 @@ class HandPart:
             mix[tip, tip - 16] = HAND_TIP_RATIO
             mix[tip, 5 + last] = 1 - HAND_TIP_RATIO
         self._mix = mix
+        self.faces, self.samples = mano.faces, _spread(mano.mesh.template.shape[0])
+
+    @functools.cached_property
+    def _surface(self) -> SkinnedPoints:
+        return _vertices(self.mano.mesh, self.samples, tuple(range(16)))
 
     @classmethod
     def state(cls, betas: Tensor, hand_pose: Tensor, global_orient: Tensor, transl: Tensor) -> State:
@@ -150,17 +177,26 @@ class HandPart:
 
     def keypoints(self, state: State) -> Keypoints:
         """21 keypoints."""
+        points, by_frame, by_shape = self._pose(self._points, state)
+        count = len(points)
+        mixed = [torch.einsum("lp,npx->nlx", self._mix, v.flatten(2)) for v in (points, by_frame, by_shape)]
+        return Keypoints(mixed[0], mixed[1].reshape(count, 63, -1), mixed[2].reshape(count, 63, -1))
+
+    def surface(self, state: State) -> Keypoints:
+        """Sample vertices."""
+        points, by_frame, by_shape = self._pose(self._surface, state)
+        return Keypoints(points, by_frame.flatten(1, 2), by_shape.flatten(1, 2))
+
+    def _pose(self, which: SkinnedPoints, state: State) -> tuple[Tensor, Tensor, Tensor]:
         count = len(state.local)
         angles = state.local.reshape(count, 15, 3)
         turns = torch.cat([state.rotation[:, None], axis_angle_to_matrix(angles)], 1)
-        points, by_shape, by_turn = self._points.pose(state.shape[None], turns)
-        by_turn = by_turn.reshape(count, 21, 3, 16, 3)
+        points, by_shape, by_turn = which.pose(state.shape[None], turns)
+        by_turn = by_turn.reshape(*points.shape, 16, 3)
         by_local = torch.einsum("npajc,njcd->npajd", by_turn[..., 1:, :], right_jacobian(angles)).flatten(3)
-        eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(count, 21, 3, 3)
+        eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*points.shape, 3)
         by_frame = torch.cat([by_turn[..., 0, :], eye, by_local], -1)
-        points = points + state.transl[:, None]
-        mixed = [torch.einsum("lp,npx->nlx", self._mix, v.flatten(2)) for v in (points, by_frame, by_shape)]
-        return Keypoints(mixed[0], mixed[1].reshape(count, 63, -1), mixed[2].reshape(count, 63, -1))
+        return points + state.transl[:, None], by_frame, by_shape
 
     def vertices(self, state: State) -> Tensor:
         """World vertices."""
@@ -211,6 +247,15 @@ def right_jacobian(angles: Tensor) -> Tensor:
     cross = skew(angles)
     eye = torch.eye(3, dtype=angles.dtype, device=angles.device)
     return eye - first * cross + second * cross @ cross
+
+
+def _spread(count: int) -> Tensor:
+    """Ids of at most `_SAMPLES` vertices, spread over the numbering."""
+    return torch.linspace(0, count - 1, min(count, _SAMPLES)).round().long()
+
+
+def _vertices(mesh: SkinnedMesh, ids: Tensor, active: tuple[int, ...]) -> SkinnedPoints:
+    return skinned_points(mesh, ids[:, None], torch.ones(len(ids), 1, dtype=mesh.template.dtype), active)
 
 
 def _rigid(points: Tensor, by_local: Tensor, by_shape: Tensor, state: State) -> Keypoints:

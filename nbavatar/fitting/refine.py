@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from nbavatar.fitting.parts import PartModel, State, retract
+from nbavatar.fitting.silhouette import Silhouettes, choose_rim, pull_to_silhouettes
 from nbavatar.fitting.system import NormalEquations, accelerations, solve
 from nbavatar.math.rotations import matrix_to_axis_angle
 
@@ -43,6 +44,7 @@ class Observations:
         agree: bool `[M, N, L]`, views that triangulation found to agree.
         K: `[M, 3, 3]` [px].
         cam_from_world: `[M, 4, 4]`.
+        masks: silhouettes in the same cameras, or None.
     """
 
     pixels: Tensor
@@ -50,6 +52,7 @@ class Observations:
     agree: Tensor
     K: Tensor
     cam_from_world: Tensor
+    masks: Silhouettes | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +118,7 @@ def refine(
     curve: list[Step] = []
     # At first motion is all but free: what it is like is read off the first result, see `_observed_smoothness`.
     typical, prior = prior.smoothness, dataclasses.replace(prior, smoothness=prior.smoothness / _FREEDOM**2)
-    agreed = dataclasses.replace(seen, confidence=seen.confidence * seen.agree)
+    agreed = dataclasses.replace(seen, confidence=seen.confidence * seen.agree, masks=None)
     schedule = [(agreed, threshold / 3, 10 * threshold), (agreed, threshold / 3, 3 * threshold)]
     left = iterations
     sigma = threshold / 3
@@ -207,6 +210,7 @@ def _descend(
     curve: list[Step],
     report: Callable[[Step], None] | None,
 ) -> tuple[State, int]:
+    seen = _with_rim(part, state, seen)
     system = _linearise(part, state, prior, seen, sigma, width)
     damping, done, used = 1e-4, False, 0
     while used < limit and not done and damping < 1e8:
@@ -243,6 +247,8 @@ def _linearise(
     system.median_px = _median(torch.cat(squared))
     # A trace of rigid precision keeps frames without any keypoint solvable; 1 / (10 m)^2 and 1 / (10 rad)^2.
     torch.diagonal(system.blocks, dim1=1, dim2=2)[:, :6] += 1e-2
+    if seen.masks is not None:
+        _add_silhouettes(system, part, state, seen, seen.masks)
     _add_prior(system, state, prior)
     _add_smoothness(system, state, prior)
     return system
@@ -271,15 +277,32 @@ def _add_keypoints(
     loss = width**2 / (width**2 + squared)
     system.cost += 0.5 * float((weight * squared * loss).sum())
     weight = weight * loss**2
-    # d(pixel) / d(world point) = K_2x2 [I | -xy] / z  R
+    jacobian = _pixel_jacobian(camera, seen)
+    weighted = weight[..., None, None] * jacobian
+    information = torch.einsum("mnlac,mnlad->nlcd", weighted, jacobian)
+    force = torch.einsum("mnlac,mnla->nlc", weighted, residual).flatten(1)
+    _add_points(system, rows, by_frame, by_shape, information, force)
+    return agreeing
+
+
+def _pixel_jacobian(camera: Tensor, seen: Observations) -> Tensor:
+    """`d(pixel) / d(world point) = K_2x2 [I | -xy] / z  R`, `[M, n, L, 2, 3]`."""
     depth = camera[..., 2].clamp_min(1e-6)
     plane = camera[..., :2] / depth[..., None]
     inner = torch.cat([torch.eye(2, dtype=plane.dtype).expand(*plane.shape[:-1], 2, 2), -plane[..., None]], -1)
     jacobian = torch.einsum("mab,mnlbc->mnlac", seen.K[:, :2, :2], inner / depth[..., None, None])
-    jacobian = torch.einsum("mnlac,mcd->mnlad", jacobian, seen.cam_from_world[:, :3, :3])
-    weighted = weight[..., None, None] * jacobian
-    information = torch.einsum("mnlac,mnlad->nlcd", weighted, jacobian)
-    force = torch.einsum("mnlac,mnla->nlc", weighted, residual).flatten(1)
+    return torch.einsum("mnlac,mcd->mnlad", jacobian, seen.cam_from_world[:, :3, :3])
+
+
+def _add_points(
+    system: NormalEquations,
+    rows: slice | Tensor,
+    by_frame: Tensor,
+    by_shape: Tensor,
+    information: Tensor,
+    force: Tensor,
+) -> None:
+    """Carries second and first derivatives by 3D points, `[n, L, 3, 3]` and `[n, 3 L]`, over to the unknowns."""
     frames, flat = by_frame.shape[:2]
 
     def pressed(derivative: Tensor) -> Tensor:
@@ -291,7 +314,48 @@ def _add_keypoints(
     system.cross[rows] += by_frame.mT @ shape_pressed
     system.shape_block += by_shape.flatten(0, 1).mT @ shape_pressed.flatten(0, 1)
     system.shape_gradient += by_shape.flatten(0, 1).mT @ force.flatten()
-    return agreeing
+
+
+def _add_silhouettes(
+    system: NormalEquations, part: PartModel, state: State, seen: Observations, masks: Silhouettes
+) -> None:
+    chosen = state.rows(masks.frames)
+    points, by_frame, by_shape = part.surface(chosen)
+    image, camera = reproject(points, seen.K, seen.cam_from_world)
+    pull = pull_to_silhouettes(masks, image, camera)
+    width = (3 * masks.deviation) ** 2
+    squared = pull.residual**2
+    loss = width / (width + squared)
+    # The weight carries the loss' derivative, loss^2; the cost is weight / loss^2 * squared * loss.
+    system.cost += 0.5 * float((pull.weight / loss * squared).sum())
+    jacobian = torch.einsum("mnla,mnlac->mnlc", pull.gradient, _pixel_jacobian(camera, seen))
+    weighted = pull.weight[..., None] * jacobian
+    information = torch.einsum("mnlc,mnld->nlcd", weighted, jacobian)
+    force = torch.einsum("mnlc,mnl->nlc", weighted, pull.residual).flatten(1)
+    _add_points(system, masks.frames, by_frame, by_shape, information, force)
+
+
+def _with_rim(part: PartModel, state: State, seen: Observations) -> Observations:
+    """Chooses which surface points the silhouettes draw, see `silhouette.choose_rim`."""
+    if seen.masks is None:
+        return seen
+    chosen = state.rows(seen.masks.frames)
+    verts = part.vertices(chosen)
+    image, camera = reproject(verts[:, part.samples], seen.K, seen.cam_from_world)
+    normals = _normals(verts, part.faces)[:, part.samples]
+    normals = torch.einsum("mij,nlj->mnli", seen.cam_from_world[:, :3, :3], normals)
+    return dataclasses.replace(seen, masks=choose_rim(seen.masks, image, camera, normals))
+
+
+def _normals(verts: Tensor, faces: np.ndarray) -> Tensor:
+    """Unit vertex normals `[n, V, 3]`, area weighted."""
+    ids = torch.from_numpy(faces)
+    corners = verts[:, ids]
+    cross = torch.linalg.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+    normals = torch.zeros_like(verts)
+    for corner in range(3):
+        normals.index_add_(1, ids[:, corner], cross)
+    return torch.nn.functional.normalize(normals, dim=-1)
 
 
 def _median(squared: Tensor) -> float:

@@ -17,10 +17,11 @@ from nbavatar.fitting.handedness import judge_handedness
 from nbavatar.fitting.observe import error_table, explained, frame_errors, keypoint_cameras, observe
 from nbavatar.fitting.parts import HandPart, HeadPart, PartModel, State
 from nbavatar.fitting.refine import Observations, Prior, Step, refine
+from nbavatar.fitting.silhouette import Silhouettes, ideal_mask, signed_distance_map
 from nbavatar.fitting.start import start_from_keypoints, start_from_parameters, with_anchor, zero_state
 from nbavatar.fitting.triangulate import Triangulation
 
-__all__ = ["Bodies", "fit_sequence"]
+__all__ = ["Bodies", "Masks", "fit_sequence"]
 
 _VERTEX_CHUNK = 64
 _LINES = 1080
@@ -39,6 +40,21 @@ class Bodies:
     hands: Mapping[str, Mano]
 
 
+@dataclasses.dataclass(frozen=True)
+class Masks:
+    """Masks of some frames.
+
+    Attributes:
+        frames: positions in the sequence, increasing.
+        images: camera -> bool `[n, H, W]`, as recorded (distorted); cameras may be missing.
+        labels: whether they show head and hands only, or (False) the whole person.
+    """
+
+    frames: Sequence[int]
+    images: Mapping[str, np.ndarray]
+    labels: bool
+
+
 def fit_sequence(
     frames: Sequence[str],
     parts: Mapping[str, Part],
@@ -47,6 +63,7 @@ def fit_sequence(
     cfg: FitConfig,
     *,
     cameras: Sequence[str] | None = None,
+    masks: Masks | None = None,
     progress: Callable[[str, Step], None] | None = None,
 ) -> tuple[MeshSequence, dict[str, Any]]:
     """Fits every part that has keypoints, all frames at once.
@@ -58,6 +75,7 @@ def fit_sequence(
         bodies: body models.
         cfg: options.
         cameras: cameras to use; all that have keypoints when None.
+        masks: silhouettes of some frames, or None.
         progress: called with the part's name after every step.
 
     Returns:
@@ -77,9 +95,12 @@ def fit_sequence(
             "tracks", "keypoints", expected="keypoints.<part>.<camera> of at least one part", found="none"
         )
     segments = _segments(extras, len(frames))
+    maps = _distance_maps(masks, cameras, extras, cfg)
     fitted, out, report = dict(parts), dict(extras), {}
     for name in names:
-        part, arrays, summary = _fit_part(name, len(frames), segments, extras, bodies, cfg, cameras, progress)
+        part, arrays, summary = _fit_part(
+            name, len(frames), segments, extras, bodies, cfg, cameras, masks, maps, progress
+        )
         fitted[name] = part
         out |= arrays
         report[name] = summary
@@ -96,6 +117,8 @@ def _fit_part(
     bodies: Bodies,
     cfg: FitConfig,
     cameras: Sequence[str] | None,
+    masks: Masks | None,
+    maps: Mapping[str, tuple[np.ndarray, float]],
     progress: Callable[[str, Step], None] | None,
 ) -> tuple[Part, dict[str, np.ndarray], dict[str, Any]]:
     used = [c for c in keypoint_cameras(extras, name) if cameras is None or c in cameras]
@@ -113,8 +136,9 @@ def _fit_part(
             name, {side: HandPart(mano) for side, mano in bodies.hands.items()}, points.points, seen, prior,
             threshold=threshold, noise_floor=cfg.noise_floor_px * scale, width=_widths(extras, used),
         )  # fmt: skip
+    shown = seen if masks is None else dataclasses.replace(seen, masks=_silhouettes(masks, maps, used, cfg, scale))
     state, curve = refine(
-        model, start, prior, seen, threshold=threshold, iterations=cfg.iterations,
+        model, start, prior, shown, threshold=threshold, iterations=cfg.iterations,
         noise_floor=cfg.noise_floor_px * scale,
         report=None if progress is None else lambda step: progress(name, step),
     )  # fmt: skip
@@ -225,6 +249,44 @@ def _prior(
     centre = mean.expand(count, -1).clone()
     shape = torch.zeros(model.shape_count, dtype=torch.float64)
     return Prior(centre, root, shape, cfg.shape_deviation, smoothness, segments)
+
+
+def _distance_maps(
+    masks: Masks | None, cameras: Sequence[str] | None, extras: Mapping[str, np.ndarray], cfg: FitConfig
+) -> dict[str, tuple[np.ndarray, float]]:
+    """Camera -> distance maps `[n, h, w]` and their scale; the same serve all parts."""
+    maps: dict[str, tuple[np.ndarray, float]] = {}
+    if masks is None or cfg.silhouette_weight == 0:
+        return maps
+    for camera, images in masks.images.items():
+        if f"camera.{camera}.K" in extras and (cameras is None or camera in cameras):
+            distortion = extras.get(f"camera.{camera}.distortion")
+            if distortion is not None and not np.any(distortion):
+                distortion = None
+            K = np.asarray(extras[f"camera.{camera}.K"], dtype=np.float64)
+            reduced, scale = ideal_mask(images, K, distortion, cfg.silhouette_lines)
+            maps[camera] = np.stack([signed_distance_map(mask, 1 / scale) for mask in reduced]), scale
+    return maps
+
+
+def _silhouettes(
+    masks: Masks, maps: Mapping[str, tuple[np.ndarray, float]], cameras: Sequence[str], cfg: FitConfig, scale: float
+) -> Silhouettes | None:
+    """Distance maps of the cameras in use; None when there are none."""
+    maps = {camera: maps[camera] for camera in cameras if camera in maps}
+    if not maps:
+        return None
+    height, width = (max(m.shape[axis] for m, _ in maps.values()) for axis in (1, 2))
+    distance = np.zeros((len(cameras), len(masks.frames), height, width), dtype=np.float32)
+    scales = np.ones(len(cameras))
+    for row, camera in enumerate(cameras):
+        if camera in maps:
+            values, scales[row] = maps[camera]
+            distance[row, :, : values.shape[1], : values.shape[2]] = values
+    return Silhouettes(
+        torch.tensor(list(masks.frames)), torch.from_numpy(distance), torch.from_numpy(scales), masks.labels,
+        cfg.silhouette_band_px * scale, cfg.silhouette_deviation_px * scale, cfg.silhouette_weight,
+    )  # fmt: skip
 
 
 def _precision(deviation: float) -> float:
