@@ -32,6 +32,7 @@ VERBS = {
     "evaluate": "PSNR, SSIM and LPIPS of stored renders",
     "speed": "time rasterization and neural rendering of an avatar",
     "table": "one table of the paper, printed and reproduced values side by side",
+    "protocol-sensitivity": "how the figures of one render move with the protocol",
     "report": "one self-contained HTML page with tables and pictures",
     "bench": "benchmarks of single kernels: raster, deform, spectral, fit",
     "doctor": "what this machine can do, and what is missing for which stage",
@@ -85,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _top_parser() -> argparse.ArgumentParser:
-    lines = "\n".join(f"  {verb:<11} {text}" for verb, text in VERBS.items())
+    lines = "\n".join(f"  {verb:<21} {text}" for verb, text in VERBS.items())
     parser = argparse.ArgumentParser(
         prog="nbavatar",
         usage="nbavatar <verb> [options]",

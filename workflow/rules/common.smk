@@ -64,10 +64,8 @@ def crop_options(wildcards):
 def protocol_options(wildcards):
     from nbavatar.config.core import to_mapping
 
-    return json.dumps(
-        {"name": wildcards.protocol} | to_mapping(RUN.protocols[wildcards.protocol]),
-        sort_keys=True,
-    )
+    values = to_mapping(RUN.protocols[wildcards.protocol]) | {"name": wildcards.protocol}
+    return json.dumps(values, sort_keys=True)
 
 
 def data_root(wildcards):
