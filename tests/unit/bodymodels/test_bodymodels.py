@@ -9,10 +9,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from smplx.lbs import find_dynamic_lmk_idx_and_bcoords
 
-from nbavatar.bodymodels.files import landmark_arrays, model_arrays, read_flame, read_mano
+from nbavatar.bodymodels.files import landmark_arrays, model_arrays, read_flame, read_landmarks, read_mano
 from nbavatar.bodymodels.flame import Flame, contour_rows, jaw_of_pose_params, rotate_about_centroid
 from nbavatar.bodymodels.lbs import joint_transforms
 from nbavatar.bodymodels.mano import TIP_PAIRS, Mano, mirror_axis_angle, mirror_model, shorten_tips
+from nbavatar.data.synthetic.legacy_pickle import Ch, Select, dump_array, dump_legacy
+from nbavatar.data.synthetic.models import flame_content, landmark_content, load_human, mano_content
 from nbavatar.errors import DataError
 
 from .modelfiles import random_flame, random_landmarks, random_mano
@@ -100,6 +102,43 @@ def test_mano_equals_smplx(mano_dict, tmp_path, dtype, tolerance):
     # smplx appends the tips in an order of its own; they are vertices, compared as such.
     tips = reference.vertices[:, list(ours.tips)]
     _assert_same([verts, joints], [reference.vertices, torch.cat([reference.joints[:, :16], tips], 1)], a, b, tolerance)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_full_size_files_equal_smplx(tmp_path, dtype):
+    """The synthetic subject's model files, at the counts of the originals, through the unpickler and through smplx."""
+    human = load_human("full")
+    head, hand = flame_content(human), mano_content(human)
+    (tmp_path / "generic_model.pkl").write_bytes(dump_legacy(head, python2=True))
+    (tmp_path / "MANO_RIGHT.pkl").write_bytes(dump_legacy(hand, python2=True))
+    (tmp_path / "landmark_embedding.npy").write_bytes(dump_array(landmark_content(human)))
+    # smplx cannot open such files without chumpy: it gets the same arrays unwrapped.
+    for name, content in (("FLAME_NEUTRAL.pkl", head), ("MANO_PLAIN_RIGHT.pkl", hand)):
+        plain = {k: v.x if isinstance(v, Ch) else v.a.x if isinstance(v, Select) else v for k, v in content.items()}
+        (tmp_path / name).write_bytes(pickle.dumps(plain, protocol=2))
+    embedding = landmark_content(human)
+    static = {"lmk_face_idx": embedding["static_lmk_faces_idx"], "lmk_b_coords": embedding["static_lmk_bary_coords"]}
+    (tmp_path / "flame_static_embedding.pkl").write_bytes(pickle.dumps(static, protocol=2))
+    arrays = read_flame(tmp_path / "generic_model.pkl")
+    ours = Flame.build(arrays, read_landmarks(tmp_path / "landmark_embedding.npy", len(arrays.faces)), dtype=dtype)
+    theirs = smplx.FLAME(str(tmp_path), num_betas=100, num_expression_coeffs=50, batch_size=BATCH, dtype=dtype)
+    a = _values(100, 50, 3, dtype=dtype)
+    b = [value.detach().clone().requires_grad_() for value in a]
+    verts = ours.forward(*a).verts
+    reference = theirs(betas=b[0], expression=b[1], jaw_pose=b[2])
+    assert verts.shape == (BATCH, 5023, 3)
+    found = [verts, ours.landmarks(verts)[:, 17:]]
+    _assert_same(found, [reference.vertices, reference.joints[:, 5:56]], a, b, 1e-5)
+    mano = Mano.build(read_mano(tmp_path / "MANO_RIGHT.pkl"), dtype=dtype)
+    theirs = smplx.MANO(
+        str(tmp_path / "MANO_PLAIN_RIGHT.pkl"), use_pca=False, flat_hand_mean=True, batch_size=BATCH, dtype=dtype
+    )
+    a = _values(10, 45, 3, 3, dtype=dtype)
+    b = [value.detach().clone().requires_grad_() for value in a]
+    verts, joints = mano.forward(*a)
+    reference = theirs(betas=b[0], hand_pose=b[1], global_orient=b[2], transl=b[3])
+    assert verts.shape == (BATCH, 778, 3)
+    _assert_same([verts, joints[:, :16]], [reference.vertices, reference.joints[:, :16]], a, b, 1e-5)
 
 
 def test_flame_zero_parameters_give_the_template(flame, flame_dict):
