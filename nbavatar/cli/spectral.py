@@ -28,7 +28,8 @@ from nbavatar.io.arrays import write_arrays
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.images import encode_png
 from nbavatar.mesh.drawing import draw_mesh, look_from, signed_colors
-from nbavatar.mesh.spectral import spectral_coordinates, texel_values
+from nbavatar.mesh.spectral import spectral_coordinates
+from nbavatar.mesh.texels import texel_values
 from nbavatar.mesh.topology import validate_mesh
 from nbavatar.provenance import run_record
 

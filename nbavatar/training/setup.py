@@ -14,7 +14,7 @@ from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.mesh.frames import face_frames
-from nbavatar.mesh.spectral import texel_values
+from nbavatar.mesh.texels import texel_values
 
 __all__ = ["initial_avatar", "modelled_parts", "neighbour_graph"]
 

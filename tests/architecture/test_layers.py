@@ -3,8 +3,7 @@ import sys
 
 import pytest
 
-# What a GPU node needs; everything else belongs to the stages that use it.
-LIGHT = {"torch", "numpy", "numba", "PIL", "tqdm", "yaml"}
+# A GPU node needs torch, numpy, numba, Pillow, tqdm and yaml; these belong to the stages that use them.
 HEAVY = (
     "igl",
     "pymeshlab",
@@ -32,13 +31,15 @@ def test_layers_import_downwards_only():
 
 @pytest.mark.parametrize("verb", ["train", "render", "speed"])
 def test_training_and_rendering_import_no_geometry_library(verb):
+    # numba itself imports SciPy where it is installed, so what is hidden here must be imported by nobody.
     code = (
-        "import sys, importlib, argparse\n"
+        "import sys, importlib\n"
+        f"for name in {HEAVY!r}: sys.modules[name] = None\n"
         "from nbavatar.provenance import code_modules\n"
         f"for name in code_modules('{verb}'):\n"
         "    if name != 'nbavatar.raster.cuda': importlib.import_module(name)\n"
-        f"print([m for m in {HEAVY!r} if m in sys.modules])"
+        "print('imported')"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert out.returncode == 0, out.stderr
-    assert out.stdout.strip().splitlines()[-1] == "[]"
+    assert out.stdout.strip().splitlines()[-1] == "imported"

@@ -8,7 +8,8 @@ import torch
 
 from nbavatar.mesh.frames import face_frames
 from nbavatar.mesh.laplacian import cotangent_laplacian, robust_laplacian
-from nbavatar.mesh.spectral import spectral_coordinates, texel_values
+from nbavatar.mesh.spectral import spectral_coordinates
+from nbavatar.mesh.texels import texel_values
 from tests.unit.mesh.shapes import grid, sphere, torus
 
 
