@@ -131,6 +131,33 @@ def _scatter(totals, i00, i01, i10, i11, w00, w01, w10, w11, grads, at, channels
 
 
 @inlined
+def _span(record, r, size, one, x_first, x_end, x_origin, dy):
+    """Columns x_first ... x_end of a row narrowed to those that the patch may cover.
+
+    Texel coordinates lie in (-1, size) where four affine functions are positive: s + w, size w - s and the
+    same for t. A tenth of a pixel is added on both sides; coverage itself is decided pixel by pixel.
+    """
+    low, high = np.float64(x_first - x_origin), np.float64(x_end - 1 - x_origin)
+    w_x, w_row = get(record, r + 6), get(record, r + 7) * dy + get(record, r + 8)
+    for side in range(4):
+        at = r + 3 * (side // 2)
+        p_x, p_row = get(record, at), get(record, at + 1) * dy + get(record, at + 2)
+        if side % 2 == 0:
+            slope, value = p_x + w_x, p_row + w_row
+        else:
+            slope, value = size * w_x - p_x, size * w_row - p_row
+        if slope > 0.0:
+            low = max(low, -np.float64(value) / np.float64(slope) - 0.1)
+        elif slope < 0.0:
+            high = min(high, -np.float64(value) / np.float64(slope) + 0.1)
+        elif value < 0.0:
+            return x_first, x_first
+    if not (low <= high):
+        return x_first, x_first
+    return x_origin + int(np.ceil(low)), x_origin + int(np.floor(high)) + 1
+
+
+@inlined
 def _release(pixel, slot, member, queue, through, sums, features, grads, grad_at, hits, chain, last, counts, entry,
              limits, texels, channels, replay):  # fmt: skip
     """Blends the hit in a queue's slot, or, in the replay, notes it."""
@@ -192,7 +219,7 @@ def traverse(turn, tiles, start, members_, offset_, record_, box, place_, featur
     )  # fmt: skip
     features, alpha, limits = pointer(features_, 0), pointer(alpha_, 0), pointer(limits_, 0)
     grads, notes = pointer(grads_, 0), pointer(notes_, 0)
-    zero, one, t_min = get(limits, 0), get(limits, 1), get(limits, 6)
+    zero, one, size, t_min = get(limits, 0), get(limits, 1), get(limits, 2), get(limits, 6)
     band = TILE_WIDTH * rows
     # Scratch: what a row of pixels found, transmittances, sums of colour, queues; then the replay's hits.
     found, through = pointer(real, 0), pointer(real, 4 * LANES)
@@ -239,9 +266,10 @@ def traverse(turn, tiles, start, members_, offset_, record_, box, place_, featur
                 own_place = get(place, i)
                 for y in range(y_first, y_end):
                     dy = zero + np.float32(y - y_origin)
-                    for x_start in range(x_first, x_end, LANES):
+                    row_first, row_end = _span(record, r, size, one, x_first, x_end, x_origin, dy)
+                    for x_start in range(row_first, row_end, LANES):
                         row_start = (y - top) * TILE_WIDTH + x_start - left
-                        mask = evaluate_row(record, r, zero + np.float32(x_start - x_origin), dy, x_end - x_start,
+                        mask = evaluate_row(record, r, zero + np.float32(x_start - x_origin), dy, row_end - x_start,
                                             alpha, np.int64(i) * texels * texels, texels, limits, through, row_start,
                                             found)  # fmt: skip
                         if mask >> 32:

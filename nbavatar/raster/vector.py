@@ -16,7 +16,7 @@ from nbavatar.raster import scalar
 
 __all__ = ["LANES", "count_trailing_zeros", "evaluate_row", "make_blend", "make_dot", "make_scatter", "make_slopes"]
 
-LANES = 16  # pixels of a row evaluated together
+LANES = 8  # pixels of a row evaluated together
 _FLAGS = ("contract", "reassoc", "nsz", "arcp")
 _I32, _I1 = ir.IntType(32), ir.IntType(1)
 
