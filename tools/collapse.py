@@ -1,8 +1,8 @@
 """Half-edge collapse down to exact vertex counts, for the asset builder.
 
-Collapsing a vertex onto a neighbour keeps the remaining vertices where they were, so the coarse mesh is a subset of the fine
-one and every per-vertex attribute (displacement targets, skin weights) carries over by indexing. Costs are quadric errors
-(Garland and Heckbert 1997) plus a small edge-length term that keeps triangles even, times an importance.
+Collapsing a vertex onto a neighbour keeps the remaining vertices where they were, so the coarse mesh is a subset of
+the fine one and every per-vertex attribute (displacement targets, skin weights) carries over by indexing. Costs are
+quadric errors (Garland and Heckbert 1997) plus a small edge-length term that keeps triangles even, times an importance.
 """
 
 import heapq
@@ -68,7 +68,11 @@ def collapse(
             return
         p = np.append(verts[v], 1.0)
         length2 = float(((verts[u] - verts[v]) ** 2).sum())
-        cost = float(p @ (quadric[u] + quadric[v]) @ p) + regularity * length2 * length2 * 1e2 + 1e-6 * regularity * length2
+        cost = (
+            float(p @ (quadric[u] + quadric[v]) @ p)
+            + regularity * length2 * length2 * 1e2
+            + 1e-6 * regularity * length2
+        )
         heapq.heappush(heap, (cost * float(importance[u]), u, v, int(stamp[u]), int(stamp[v])))
 
     def allowed(u: int, v: int) -> bool:

@@ -1,15 +1,18 @@
 """Writes a complete synthetic dataset in the layout of the Decaf release, with licence-free body models.
 
-Everything a reader of the release needs is written below --out: body models and index files in `assets/`, and for each subject videos and
-mask videos (mp4) of every camera, keypoints with confidence, boxes, contacts, deformations, parameters, cameras and cuts, in `train/` or
-`test/` as in the release (S1, S3, S6 in `test/`). Lengths are metres, angles radians, pixels those of the full, distorted frame.
+Everything a reader of the release needs is written below --out: body models and index files in `assets/`, and for
+each subject videos and mask videos (mp4) of every camera, keypoints with confidence, boxes, contacts, deformations,
+parameters, cameras and cuts, in `train/` or `test/` as in the release (S1, S3, S6 in `test/`). Lengths are metres,
+angles radians, pixels those of the full, distorted frame.
 
-The people are made from MakeHuman's CC0 base mesh; the dents under the fingers come from a biharmonic displacement field, not from the
-simulation of `nbavatar deform`, so they can serve as a reference for it. The same options and seed give the same files.
+The people are made from MakeHuman's CC0 base mesh; the dents under the fingers come from a biharmonic displacement
+field, not from the simulation of `nbavatar deform`, so they can serve as a reference for it. The same options and
+seed give the same files.
 
 examples:
   nbavatar synthesize --out resources/SyntheticDecaf
-  nbavatar synthesize --out /tmp/tiny --cfg '{"mesh": "tiny", "subjects": ["S2"], "width": 128, "height": 72, "frames": 14}'
+  nbavatar synthesize --out /tmp/tiny --cfg '{"mesh": "tiny", "subjects": ["S2"], "width": 128, "height": 72,
+  "frames": 14}'
 """
 
 import argparse

@@ -1,11 +1,11 @@
 """Z-buffer of triangle meshes: which face each pixel sees, where on it, and how far away.
 
 A small, exact rasterizer for silhouettes, overlays and the synthetic data; it has no gradients and no textures.
-Visibility is decided in camera space: for the viewing ray ``r`` of a pixel centre and a triangle ``X0 X1 X2``, the three
-signed volumes ``r . (Xj x Xk)`` are, up to a common factor, the perspective-correct barycentric coordinates
+Visibility is decided in camera space: for the viewing ray ``r`` of a pixel centre and a triangle ``X0 X1 X2``, the
+three signed volumes ``r . (Xj x Xk)`` are, up to a common factor, the perspective-correct barycentric coordinates
 (homogeneous rasterization, Olano and Greer 1997). Two things follow. Triangles that cross the camera plane need no
-clipping, only a comparison per pixel; and the volumes of an edge seen from its two triangles are exact negatives of each
-other in floating point, so closed surfaces have no cracks.
+clipping, only a comparison per pixel; and the volumes of an edge seen from its two triangles are exact negatives of
+each other in floating point, so closed surfaces have no cracks.
 """
 
 import os
@@ -18,7 +18,9 @@ __all__ = ["project_bounds", "rasterize_mesh"]
 
 
 @numba.njit(cache=True, nogil=True)
-def project_bounds(verts: np.ndarray, face: np.ndarray, k: np.ndarray, near: float) -> tuple[float, float, float, float]:
+def project_bounds(
+    verts: np.ndarray, face: np.ndarray, k: np.ndarray, near: float
+) -> tuple[float, float, float, float]:
     """Pixel bounds of the part of one triangle beyond the near plane (an empty interval if there is none).
 
     Args:
@@ -46,10 +48,10 @@ def project_bounds(verts: np.ndarray, face: np.ndarray, k: np.ndarray, near: flo
 
 
 @numba.njit(cache=True, nogil=True)
-def _cover(verts, faces, bounds, k, near, row0, row1, cull, face_id, bary, depth):  # noqa: PLR0913
+def _cover(verts, faces, bounds, k, near, row0, row1, cull, face_id, bary, depth):
     """Draw all faces into the rows ``row0 <= y < row1`` of the three images, in place."""
     width = face_id.shape[1]
-    normals = np.empty((3, 3))
+    normals = np.zeros((3, 3))
     for f in range(len(faces)):
         if not (bounds[f, 2] < row1 and bounds[f, 3] > row0):
             continue
@@ -91,7 +93,7 @@ def _cover(verts, faces, bounds, k, near, row0, row1, cull, face_id, bary, depth
 
 @numba.njit(cache=True, nogil=True)
 def _all_bounds(verts, faces, k, near):
-    bounds = np.empty((len(faces), 4))
+    bounds = np.zeros((len(faces), 4))
     for f in range(len(faces)):
         bounds[f, 0], bounds[f, 1], bounds[f, 2], bounds[f, 3] = project_bounds(verts, faces[f], k, near)
     return bounds
@@ -125,9 +127,9 @@ def rasterize_mesh(
             not depend on it.
 
     Returns:
-        ``face_id`` (H, W) int32 with -1 where nothing is seen, ``bary`` (H, W, 3) float32 perspective-correct weights of
-        the face's three vertices (0 where nothing is seen), ``depth`` (H, W) float32 z [m] (inf where nothing is seen).
-        Where two faces meet at the same depth the one with the lower id is returned.
+        ``face_id`` (H, W) int32 with -1 where nothing is seen, ``bary`` (H, W, 3) float32 perspective-correct weights
+        of the face's three vertices (0 where nothing is seen), ``depth`` (H, W) float32 z [m] (inf where nothing is
+        seen). Where two faces meet at the same depth the one with the lower id is returned.
 
     Raises:
         ValueError: if a shape is wrong, a coordinate is not finite or ``K`` has skew.
@@ -148,15 +150,19 @@ def rasterize_mesh(
     face_id = np.full((height, width), -1, np.int32)
     bary = np.zeros((height, width, 3), np.float32)
     depth = np.full((height, width), np.inf)  # float64: ties must not depend on the rounding of what was stored
-    # A camera-space triangle seen from outside has its right-hand normal towards the camera, i.e. a negative volume with
+    # A camera-space triangle seen from outside has its right-hand normal towards the camera, i.e. a negative volume
+    # with
     # z forward; the kernel culls negative ones, so the ids are reversed (and put back in the weights).
     if cull_back:
         faces = np.ascontiguousarray(faces[:, ::-1])
     bounds = _all_bounds(verts, faces, k, near)
-    workers = workers or int(os.environ.get("NUMBA_NUM_THREADS", 0)) or os.cpu_count() or 1
+    workers = workers or int(os.environ.get("NUMBA_NUM_THREADS", "0")) or os.cpu_count() or 1
     workers = 1 if width * height < 1 << 16 else min(workers, 16)
     edges = np.linspace(0, height, workers + 1).astype(int)
-    jobs = [(verts, faces, bounds, k, near, a, b, cull_back, face_id, bary, depth) for a, b in zip(edges, edges[1:], strict=False)]
+    jobs = [
+        (verts, faces, bounds, k, near, a, b, cull_back, face_id, bary, depth)
+        for a, b in zip(edges, edges[1:], strict=False)
+    ]
     if workers == 1:
         _cover(*jobs[0])
     else:

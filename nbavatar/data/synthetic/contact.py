@@ -1,13 +1,14 @@
-"""Reference dent of a soft head under a rigid hand: a thin-plate displacement field, pushed out of the hand until nothing penetrates.
+"""Reference dent of a soft head under a rigid hand: a thin-plate displacement field, pushed out of the hand until
+nothing penetrates.
 
 This is NOT the method of the pipeline's contact stage (a particle simulation): the displacement ``d`` minimises
 
     sum_i m_i |(L d)_i|^2 + a sum_i m_i |d_i|^2 + w sum_(i in A) |d_i - t_i|^2
 
-with the cotangent Laplacian ``L`` and lumped masses ``m``, i.e. a bending plate on an elastic bed (biharmonic with decay).
-The set ``A`` and its targets ``t`` start empty; every round the hand's surface points inside the deformed head, and the
-head's vertices inside the hand, add what is needed to leave each other along the head's inward normals, and the field is solved
-again. It ends when the deepest remaining point is below the tolerance.
+with the cotangent Laplacian ``L`` and lumped masses ``m``, i.e. a bending plate on an elastic bed (biharmonic with
+decay). The set ``A`` and its targets ``t`` start empty; every round the hand's surface points inside the deformed
+head, and the head's vertices inside the hand, add what is needed to leave each other along the head's inward normals,
+and the field is solved again. It ends when the deepest remaining point is below the tolerance.
 """
 
 import dataclasses
@@ -22,7 +23,9 @@ _DEEPEST = 0.03
 _FANS: dict[bytes, tuple[np.ndarray, list[np.ndarray]]] = {}
 
 
-def signed_distance(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def signed_distance(
+    points: np.ndarray, verts: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance to a surface, negative inside; holes (neck, wrist) count as closed by the fan over their rim.
 
     Inside is where the generalised winding number is above one half, so surfaces that cut themselves (lips) do no harm.
@@ -41,7 +44,9 @@ def signed_distance(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) ->
     faces = np.ascontiguousarray(faces, np.int64)
     squared, face, nearest = igl.point_mesh_squared_distance(points, verts, faces)
     distance = np.sqrt(squared)
-    candidates = np.flatnonzero(distance < _DEEPEST)  # nothing is ever deeper: the winding number is not needed further off
+    candidates = np.flatnonzero(
+        distance < _DEEPEST
+    )  # nothing is ever deeper: the winding number is not needed further off
     if len(candidates):
         fan, hub = rim_fan(faces, len(verts))
         closed = np.concatenate([verts, *(verts[ring].mean(0, keepdims=True) for ring in hub)])
@@ -171,7 +176,10 @@ def dent(
     # the direction must not swirl at fine folds (lips, nostrils): average it over about a centimetre
     ends = surface.faces[:, [0, 1]]
     edge = float(np.median(np.linalg.norm(head[ends[:, 0]] - head[ends[:, 1]], axis=1)))
-    ring = sp.coo_matrix((np.ones(3 * len(surface.faces)), (surface.faces.ravel(), np.roll(surface.faces, 1, 1).ravel())), (len(head),) * 2)
+    ring = sp.coo_matrix(
+        (np.ones(3 * len(surface.faces)), (surface.faces.ravel(), np.roll(surface.faces, 1, 1).ravel())),
+        (len(head),) * 2,
+    )
     ring = sp.csr_matrix(ring + ring.T + sp.eye(len(head)))
     for _ in range(int(np.clip((0.011 / edge) ** 2, 2, 30))):
         inward = ring @ inward
@@ -192,7 +200,9 @@ def dent(
             weight /= np.maximum(weight.sum(1, keepdims=True), 0.2)
             need = -distance[deep] + tolerance / 4
             share = weight / np.maximum((weight**2).sum(1, keepdims=True), 0.05)
-            np.maximum.at(push, corners.ravel(), (share * need[:, None]).clip(0, 0.02).ravel() * (weight.ravel() > 0.15))
+            np.maximum.at(
+                push, corners.ravel(), (share * need[:, None]).clip(0, 0.02).ravel() * (weight.ravel() > 0.15)
+            )
         close = np.flatnonzero(surface.movable & (np.linalg.norm(verts - hand.mean(0), axis=1) < 0.2))
         inside_depth = 0.0
         if len(close):

@@ -1,8 +1,10 @@
-"""A complete synthetic dataset in the exact layout of the Decaf release, so that the readers run the code they run on the real thing.
+"""A complete synthetic dataset in the exact layout of the Decaf release, so that the readers run the code they run on
+the real thing.
 
-What the release has and people trip over is there too: subjects in two split folders, world-to-camera extrinsics as 4x4 lists, distortion under a
-further key, masks of the whole person as lossy video, boxes of -1, missing keypoints, deformations in the canonical frame with the minus sign
-and rubbish at the neck, frame keys as text without zero padding, pickles as Python 2 and 3.7 wrote them.
+What the release has and people trip over is there too: subjects in two split folders, world-to-camera extrinsics as
+4x4 lists, distortion under a further key, masks of the whole person as lossy video, boxes of -1, missing keypoints,
+deformations in the canonical frame with the minus sign and rubbish at the neck, frame keys as text without zero
+padding, pickles as Python 2 and 3.7 wrote them.
 """
 
 from collections.abc import Callable, Iterable
@@ -81,19 +83,37 @@ def write_dataset(
         DataError: odd image size, or a codec that this OpenCV does not write.
     """
     if width % 2 or height % 2:
-        raise DataError.of("synthesize", "width, height", expected="even numbers (video codecs need them)", found=f"{width}x{height}")
+        raise DataError.of(
+            "synthesize", "width, height", expected="even numbers (video codecs need them)", found=f"{width}x{height}"
+        )
     bodies = build_bodies(mesh)
     write_assets(root, bodies.human)
     for name in subjects:
         scene = make_scene(
-            bodies, name, frames, seed, press=press, progress=lambda items, name=name: progress(items, f"{name} motion", frames)
-        )  # fmt: skip
+            bodies,
+            name,
+            frames,
+            seed,
+            press=press,
+            progress=lambda items, name=name: progress(items, f"{name} motion", frames),
+        )
         rig = make_cameras(cameras, width, height, focal=focal, distortion=distortion, seed=seed)
         write_subject(
-            root, scene, rig, supersample=supersample, keypoint_noise=keypoint_noise * height / 1080, missing=missing,
-            parameter_noise=parameter_noise, codec=codec, seed=seed, workers=workers, progress=progress,
-        )  # fmt: skip
-    write_json(root / "synthetic.json", {"subjects": list(subjects), "cameras": list(cameras), "mesh": mesh, **(record or {})})
+            root,
+            scene,
+            rig,
+            supersample=supersample,
+            keypoint_noise=keypoint_noise * height / 1080,
+            missing=missing,
+            parameter_noise=parameter_noise,
+            codec=codec,
+            seed=seed,
+            workers=workers,
+            progress=progress,
+        )
+    write_json(
+        root / "synthetic.json", {"subjects": list(subjects), "cameras": list(cameras), "mesh": mesh, **(record or {})}
+    )
 
 
 def write_assets(root: Path, human: Human) -> None:
@@ -137,19 +157,33 @@ def write_subject(
             stored[f"{part}.{key}"] += rng.normal(0, parameter_noise * size, (count, 3))
     # text keys without zero padding: sorted as text, frame 10 would come before frame 2
     frames = {
-        str(n): {part: {key.split(".")[1]: value[n].astype(np.float32) for key, value in stored.items() if key.startswith(part + ".")} for part in ("head", "right_hand")}
+        str(n): {
+            part: {
+                key.split(".")[1]: value[n].astype(np.float32)
+                for key, value in stored.items()
+                if key.startswith(part + ".")
+            }
+            for part in ("head", "right_hand")
+        }
         for n in range(count)
-    }  # fmt: skip
+    }
     _bytes(base / "params" / name / "params_smoothed.pkl", dump_legacy(frames))
     rig = {
-        camera: {"intrinsic": c.K, "extrinsic": c.cam_from_world.tolist(), "distortion": np.zeros(5) if c.distortion is None else c.distortion}
+        camera: {
+            "intrinsic": c.K,
+            "extrinsic": c.cam_from_world.tolist(),
+            "distortion": np.zeros(5) if c.distortion is None else c.distortion,
+        }
         for camera, c in cameras.items()
     }
     _bytes(base / "cameras" / name / "cameras.pkl", dump_legacy(rig))
     segments = scene.motion.segments
     cuts = [(int(a[1]), int(b[0])) for a, b in zip(segments, segments[1:], strict=False)]
     _bytes(base / "cutIDs" / f"{name}.pkl", dump_legacy(cuts))
-    shape = {"head": {"shape_params": scene.subject.shape.astype(np.float32)}, "right_hand": {"betas": scene.subject.betas.astype(np.float32)}}
+    shape = {
+        "head": {"shape_params": scene.subject.shape.astype(np.float32)},
+        "right_hand": {"betas": scene.subject.betas.astype(np.float32)},
+    }
     _bytes(assets / "accurate_shapes" / f"{name}.pkl", dump_legacy(shape))
 
     rotation = _rotations(scene)
@@ -225,7 +259,14 @@ def _rotations(scene: Scene) -> np.ndarray:
 
 
 def _write_videos(
-    base: Path, scene: Scene, cameras: dict[str, Camera], supersample: int, codec: str, seed: int, workers: int, progress: Progress
+    base: Path,
+    scene: Scene,
+    cameras: dict[str, Camera],
+    supersample: int,
+    codec: str,
+    seed: int,
+    workers: int,
+    progress: Progress,
 ) -> None:
     """Renders frame by frame, all cameras at once, so that a frame's shadow maps are made once."""
     from concurrent.futures import ThreadPoolExecutor
@@ -265,9 +306,13 @@ class _Videos:
         try:
             for path in self._paths:
                 temporary = self._stack.enter_context(atomic_write(path))
-                writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*self._codec), FRAMES_PER_SECOND, self._size)
+                writer = cv2.VideoWriter(
+                    str(temporary), cv2.VideoWriter_fourcc(*self._codec), FRAMES_PER_SECOND, self._size
+                )
                 if not writer.isOpened():
-                    raise DataError.of(path, "codec", expected="one that this OpenCV writes, such as mp4v", found=self._codec)
+                    raise DataError.of(
+                        path, "codec", expected="one that this OpenCV writes, such as mp4v", found=self._codec
+                    )
                 self._stack.callback(writer.release)
                 self._writers.append(writer)
         except BaseException as error:
@@ -294,9 +339,10 @@ def _save(path: Path, array: np.ndarray) -> None:
 
 def _ply(verts: np.ndarray, faces: np.ndarray) -> bytes:
     header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(verts)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(verts)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    rows = np.empty(len(faces), dtype=[("n", "u1"), ("ids", "<i4", 3)])
+    rows = np.zeros(len(faces), dtype=[("n", "u1"), ("ids", "<i4", 3)])
     rows["n"], rows["ids"] = 3, faces
     return header.encode("ascii") + verts.astype("<f4").tobytes() + rows.tobytes()

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 
+from nbavatar.data.synthetic.contact import vertex_normals
 from nbavatar.data.synthetic.models import EYE_ORIGIN, Human, hand_axes
 from nbavatar.data.synthetic.motion import Subject
 from nbavatar.data.synthetic.scene import STAGE_TO_WORLD, Scene
 from nbavatar.data.synthetic.shading import ARM, CLOTH, EYE, HAIR, HAND, SKIN, hairline
-from nbavatar.data.synthetic.contact import vertex_normals
 
 __all__ = ["Figure", "Looks", "build_figure", "looks_of", "pose_figure"]
 
@@ -61,7 +61,9 @@ def looks_of(human: Human, subject: Subject) -> Looks:
     points = (human.head[human.head_faces[human.landmark_faces]] * human.landmark_bary[..., None]).sum(1)
     q = (points - EYE_ORIGIN) * 1e3
     upper, lower = q[[51, 50, 49, 48]], q[[57, 58, 59, 48]]
-    lips = np.stack([np.abs(upper[:, 0]), upper[:, 1], np.interp(np.abs(upper[:, 0]), np.abs(lower[:, 0]), lower[:, 1])], 1)
+    lips = np.stack(
+        [np.abs(upper[:, 0]), upper[:, 1], np.interp(np.abs(upper[:, 0]), np.abs(lower[:, 0]), lower[:, 1])], 1
+    )
     brow = np.stack([np.abs(q[21:16:-1, 0]) + 1.0, q[21:16:-1, 1] - [1.0, 3.0, 4.0, 3.5, 2.5]], 1)
     skin, left, _ = human.part_sizes
     centres = np.stack([human.head[skin : skin + left].mean(0), human.head[skin + left :].mean(0)])
@@ -74,11 +76,18 @@ def looks_of(human: Human, subject: Subject) -> Looks:
         along = (tips[finger] - last) / np.linalg.norm(tips[finger] - last)
         back = -np.cross(along, bend[3 * finger + 2])
         back = back if back[1] > 0 else -back
-        nails.append(np.concatenate([(tips[finger] - 0.0065 * along + 0.0035 * back) * 1e3, along, back]))
+        nails.append(np.concatenate([(tips[finger] - 0.0065 * along + 0.0025 * back) * 1e3, along, back]))
     knuckles = joints[[i for i in range(1, 16)]] * 1e3 + np.array([0, 7.0, 0])
-    colours = np.stack([
-        _linear(subject.skin), _linear(subject.hair), _linear(subject.iris), _linear(subject.shirt), [0.36, 0.40, 0.46], [0.16, 0.14, 0.13],
-    ])  # fmt: skip
+    colours = np.stack(
+        [
+            _linear(subject.skin),
+            _linear(subject.hair),
+            _linear(subject.iris),
+            _linear(subject.shirt),
+            [0.36, 0.40, 0.46],
+            [0.16, 0.14, 0.13],
+        ]
+    )
     return Looks(colours, lips, brow, (centres - EYE_ORIGIN) * 1e3, np.array(nails), knuckles, float(subject.seed % 97))
 
 
@@ -111,10 +120,15 @@ def build_figure(scene: Scene) -> Figure:
     counts = (len(q), len(human.hand), len(ids), len(torso), _ARM_RINGS * _ARM_SIDES)
     start = np.concatenate([[0], np.cumsum(counts)[:-1]])
     faces = np.concatenate([f + s for f, s in zip(pieces, start, strict=True)])
-    material = np.concatenate([
-        np.where((human.head_faces < skin).all(1), SKIN, EYE), np.full(len(human.hand_faces), HAND), np.full(len(scalp), HAIR),
-        np.full(len(torso[human.torso_faces]), CLOTH), np.where(sleeve, CLOTH, ARM),
-    ])  # fmt: skip
+    material = np.concatenate(
+        [
+            np.where((human.head_faces < skin).all(1), SKIN, EYE),
+            np.full(len(human.hand_faces), HAND),
+            np.full(len(scalp), HAIR),
+            np.full(len(torso[human.torso_faces]), CLOTH),
+            np.where(sleeve, CLOTH, ARM),
+        ]
+    )
     ring, side = np.divmod(np.arange(counts[4]), _ARM_SIDES)
     angle = 2 * np.pi * side / _ARM_SIDES
     arm_rest = np.stack([40 * np.cos(angle), ring * 22.0, 40 * np.sin(angle)], 1)

@@ -1,8 +1,9 @@
 """Pickles as the official model files hold them.
 
-FLAME and MANO were pickled by Python 2 with numpy 1, scipy and chumpy: byte strings without a type, module names that have
-moved since, and arrays wrapped in `chumpy.ch.Ch`. Writing the same opcodes makes readers prove themselves on what they will meet,
-and needs none of those packages. The dataset's own pickles come from Python 3.7 with numpy 1 (protocol 3, typed bytes).
+FLAME and MANO were pickled by Python 2 with numpy 1, scipy and chumpy: byte strings without a type, module names that
+have moved since, and arrays wrapped in `chumpy.ch.Ch`. Writing the same opcodes makes readers prove themselves on
+what they will meet, and needs none of those packages. The dataset's own pickles come from Python 3.7 with numpy 1
+(protocol 3, typed bytes).
 """
 
 import io
@@ -23,7 +24,7 @@ class Ch:
 
 
 class Select:
-    """Stands for `chumpy.reordering.Select`: elements `idxs` of the raveled array `a`, in the shape `preferred_shape`."""
+    """Stands for `chumpy.reordering.Select`: entries `idxs` of the raveled `a`, in shape `preferred_shape`."""
 
     def __init__(self, a: Ch, idxs: np.ndarray, preferred_shape: tuple[int, ...]) -> None:
         self.a, self.idxs, self.preferred_shape = a, idxs, preferred_shape
@@ -39,18 +40,24 @@ _MODULES = {
 }
 
 
-class _LegacyPickler(pickle._Pickler):  # noqa: SLF001  the C pickler cannot be told which opcodes to write
+# the C pickler cannot be told which opcodes to write
+_PythonPickler: Any = pickle._Pickler
+
+
+class _LegacyPickler(_PythonPickler):
     """Writes today's objects under the names that they had."""
 
-    dispatch = pickle._Pickler.dispatch.copy()  # noqa: SLF001
+    dispatch = _PythonPickler.dispatch.copy()
 
     def __init__(self, stream: io.BytesIO, python2: bool) -> None:
         super().__init__(stream, protocol=2 if python2 else 3)
         self._python2 = python2
 
     def save_global(self, obj: Any, name: str | None = None) -> None:
-        module, name = _NAMES.get(obj, (getattr(obj, "__module__", None), name or getattr(obj, "__qualname__", obj.__name__)))
-        module = _MODULES.get(module, module)
+        module, name = _NAMES.get(
+            obj, (getattr(obj, "__module__", None), name or getattr(obj, "__qualname__", obj.__name__))
+        )
+        module = _MODULES.get(str(module), str(module))
         if self._python2:
             module = {"builtins": "__builtin__", "copyreg": "copy_reg"}.get(module, module)
         self.write(pickle.GLOBAL + f"{module}\n{name}\n".encode("ascii"))
@@ -58,7 +65,7 @@ class _LegacyPickler(pickle._Pickler):  # noqa: SLF001  the C pickler cannot be 
 
     def _save_bytes(self, obj: bytes) -> None:
         if not self._python2:
-            pickle._Pickler.save_bytes(self, obj)  # noqa: SLF001
+            _PythonPickler.save_bytes(self, obj)
             return
         self.write(pickle.BINSTRING + struct.pack("<i", len(obj)) + obj)
         self.memoize(obj)
@@ -84,6 +91,6 @@ def dump_array(content: Any) -> bytes:
     """A `.npy` file of numpy format 1.0 holding one object in a 0-d array (how `np.save` stores a dictionary)."""
     stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, {"shape": (), "fortran_order": False, "descr": "|O"})
-    holder = np.empty((), dtype=object)
+    holder = np.zeros((), dtype=object)
     holder[()] = content
     return stream.getvalue() + dump_legacy(holder)

@@ -1,9 +1,10 @@
 """Licence-free body models with the arrays of the official files: a FLAME-like head and MANO-like hands.
 
-Shape, expression targets and skin weights are MakeHuman's (CC0), see `assets/LICENSE.md`; `full` has exactly the counts of the
-official models (5,023 vertices and 9,976 faces; 778 and 1,538), `tiny` is a subset of its vertices (612; 200). The first 60 shape and 40
-expression directions are principal directions of MakeHuman's targets (one standard deviation each), the others up to
-300 + 100 small smooth fields, so that every column of the official layout exists and does something.
+Shape, expression targets and skin weights are MakeHuman's (CC0), see `assets/LICENSE.md`; `full` has exactly the
+counts of the official models (5,023 vertices and 9,976 faces; 778 and 1,538), `tiny` is a subset of its vertices
+(612; 200). The first 60 shape and 40 expression directions are principal directions of MakeHuman's targets (one
+standard deviation each), the others up to 300 + 100 small smooth fields, so that every column of the official layout
+exists and does something.
 Frame as in FLAME and MANO: metres, y up, the face looks along +z, the subject's left is +x; the right hand points along
 -x with its palm down.
 """
@@ -17,7 +18,16 @@ import numpy as np
 
 from nbavatar.data.synthetic.legacy_pickle import Ch, Select
 
-__all__ = ["EYE_ORIGIN", "Human", "flame_content", "hand_axes", "landmark_content", "load_human", "mano_content", "mirrored_mano_content"]
+__all__ = [
+    "EYE_ORIGIN",
+    "Human",
+    "flame_content",
+    "hand_axes",
+    "landmark_content",
+    "load_human",
+    "mano_content",
+    "mirrored_mano_content",
+]
 
 EYE_ORIGIN = np.array([0.0, 0.8035, 0.126])
 """Point between the eyes of the head template [m]; texture coordinates count from here."""
@@ -31,7 +41,7 @@ class Human:
 
     Attributes:
         head, hand: templates (V, 3); `head_faces`, `hand_faces` (F, 3) int64.
-        head_shape (V, 3, 60), head_expression (V, 3, 40), hand_shape (V, 3, 10): directions, one standard deviation each.
+        head_shape (V, 3, 60), head_expression (V, 3, 40), hand_shape (V, 3, 10): one standard deviation each.
         head_weights (V, 5), hand_weights (V, 16): skin weights, rows sum to 1.
         head_regressor (5, V), hand_regressor (16, V): joints from vertices.
         landmark_faces (68,), landmark_bary (68, 3): landmarks on the head's faces.
@@ -117,7 +127,7 @@ def load_human(mesh: str = "full") -> Human:
         hand_weights=weights("hand.weights", hand_ids),
         hand_regressor=regressor(f"{hand}.regressor"),
         tips=whole(f"{hand}.tips"),
-        units=dict(zip([str(n) for n in raw["head.unit_names"]], raw["head.unit_coefficients"].astype(np.float64), strict=True)),
+        units={str(n): row.astype(np.float64) for n, row in zip(raw["head.unit_names"], raw["head.unit_coefficients"])},
         torso=raw["torso.verts"].astype(np.float64),
         torso_faces=whole("torso.faces"),
         shoulder=raw["torso.shoulder"].astype(np.float64),
@@ -198,7 +208,7 @@ def mirrored_mano_content(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def landmark_content(human: Human) -> dict[str, np.ndarray]:
-    """The dictionary of `landmark_embedding.npy`: 68 fixed landmarks, the inner 51, and the contour for 79 yaw steps."""
+    """The dictionary of `landmark_embedding.npy`: 68 fixed landmarks, the inner 51, the contour for 79 yaw steps."""
     faces, bary = human.landmark_faces, human.landmark_bary
     contour_faces, contour_bary = _contours(human)
     return {
@@ -244,7 +254,7 @@ def _sample_poses(joints: np.ndarray, rng: np.random.Generator, count: int = 400
 
 
 def _smooth_fields(human: Human, count: int, size: float, rng: np.random.Generator) -> np.ndarray:
-    """Displacement fields (V, 3, count) of a few waves across the head, fading with their index; eyeballs move rigidly."""
+    """Displacement fields (V, 3, count) of a few waves across the head, fading with their index, eyeballs whole."""
     points = human.head.copy()
     skin, left, _ = human.part_sizes
     points[skin : skin + left] = points[skin : skin + left].mean(0)
@@ -289,7 +299,8 @@ def _contours(human: Human) -> tuple[np.ndarray, np.ndarray]:
             side = np.sign(rest[k, 0])
             if side * view[0] >= 0 or abs(rest[k, 0]) < 0.01:
                 continue  # this half faces the viewer: its contour stays on the jaw
-            cost = 30 * np.abs(normal @ view) * 1e-3 + np.abs(centre[:, 1] - rest[k, 1]) + 0.15 * np.linalg.norm(centre - rest[k], axis=1)
+            away = np.linalg.norm(centre - rest[k], axis=1)
+            cost = 0.03 * np.abs(normal @ view) + np.abs(centre[:, 1] - rest[k, 1]) + 0.15 * away
             cost = np.where(face & (centre[:, 0] * side > 0), cost, np.inf)
             faces[row, k], bary[row, k] = ids[cost.argmin()], 1 / 3
     return faces, bary

@@ -1,7 +1,8 @@
 """What the subjects do: expressions, jaw, head turns, and a hand that approaches, presses, slides and leaves.
 
-The stage has y up and the room's front along +z, in metres, with the resting head where its template is. Every sequence has one cut: two takes
-with a touch at another place each (cheek, chin, temple, brow), so that nothing may run on across it.
+The stage has y up and the room's front along +z, in metres, with the resting head where its template is. Every
+sequence has one cut: two takes with a touch at another place each (cheek, chin, temple, brow), so that nothing may
+run on across it.
 """
 
 import dataclasses
@@ -38,11 +39,43 @@ class Touch:
 
 # Places are seen from a point 80 mm behind and 45 mm below the eyes.
 TOUCHES = {
-    "cheek": Touch((-0.72, 0.06, 0.74), (0.15, 0.93, -0.1), (0.0, -0.016, 0.010), (0.16, 0.10, 0.2, 0.28, -0.1), ((0, 2, 1.0), (1, 2, 1.0), (3, 2, 0.6)), 0.1, 0.3),
-    "chin": Touch((-0.40, -0.52, 0.80), (0.75, 0.5, 0.2), (-0.02, 0.004, -0.006), (0.38, 0.30, 0.05, 0.14, 0.1), ((0, 2, 1.0), (1, 2, 1.0)), 0.05, 0.25),
-    "temple": Touch((-0.74, 0.74, 0.42), (0.25, 0.9, -0.1), (0.0, 0.010, 0.014), (0.25, 0.2, 0.3, 0.45, 0.0), ((0, 2, 1.0), (1, 2, 1.0)), 0.0, 0.3),
-    "mouth": Touch((-0.60, -0.20, 0.80), (0.8, 0.5, 0.0), (-0.02, 0.006, -0.004), (0.25, 0.2, 0.0, 0.1, 0.0), ((0, 2, 1.0), (1, 2, 1.0)), 0.05, 0.25),
-}  # fmt: skip
+    "cheek": Touch(
+        (-0.72, 0.06, 0.74),
+        (0.15, 0.93, -0.1),
+        (0.0, -0.016, 0.010),
+        (0.16, 0.10, 0.2, 0.28, -0.1),
+        ((0, 2, 1.0), (1, 2, 1.0), (3, 2, 0.6)),
+        0.1,
+        0.3,
+    ),
+    "chin": Touch(
+        (-0.40, -0.52, 0.80),
+        (0.75, 0.5, 0.2),
+        (-0.02, 0.004, -0.006),
+        (0.38, 0.30, 0.05, 0.14, 0.1),
+        ((0, 2, 1.0), (1, 2, 1.0)),
+        0.05,
+        0.25,
+    ),
+    "temple": Touch(
+        (-0.74, 0.74, 0.42),
+        (0.25, 0.9, -0.1),
+        (0.0, 0.010, 0.014),
+        (0.25, 0.2, 0.3, 0.45, 0.0),
+        ((0, 2, 1.0), (1, 2, 1.0)),
+        0.0,
+        0.3,
+    ),
+    "mouth": Touch(
+        (-0.70, -0.16, 0.70),
+        (0.8, 0.5, 0.0),
+        (-0.02, 0.006, -0.004),
+        (0.25, 0.2, 0.0, 0.1, 0.0),
+        ((0, 2, 1.0), (1, 2, 1.0)),
+        0.05,
+        0.25,
+    ),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,12 +126,57 @@ class Motion:
     segments: list[tuple[int, int]]
 
 
-_SKINS = ((0.80, 0.58, 0.46), (0.86, 0.66, 0.55), (0.55, 0.37, 0.27), (0.74, 0.53, 0.39), (0.90, 0.71, 0.61), (0.42, 0.28, 0.20), (0.83, 0.62, 0.48), (0.66, 0.46, 0.34))
-_HAIRS = ((0.10, 0.07, 0.05), (0.22, 0.13, 0.07), (0.05, 0.04, 0.04), (0.09, 0.06, 0.05), (0.48, 0.33, 0.17), (0.04, 0.03, 0.03), (0.30, 0.17, 0.09), (0.14, 0.10, 0.08))
-_IRISES = ((0.30, 0.18, 0.09), (0.25, 0.38, 0.48), (0.20, 0.12, 0.07), (0.35, 0.30, 0.14), (0.33, 0.45, 0.50), (0.18, 0.11, 0.07), (0.30, 0.36, 0.22), (0.24, 0.14, 0.08))
-_SHIRTS = ((0.20, 0.32, 0.46), (0.42, 0.18, 0.20), (0.72, 0.70, 0.66), (0.18, 0.36, 0.28), (0.50, 0.42, 0.25), (0.30, 0.30, 0.34), (0.55, 0.30, 0.42), (0.16, 0.20, 0.30))
+_SKINS = (
+    (0.80, 0.58, 0.46),
+    (0.86, 0.66, 0.55),
+    (0.55, 0.37, 0.27),
+    (0.74, 0.53, 0.39),
+    (0.90, 0.71, 0.61),
+    (0.42, 0.28, 0.20),
+    (0.83, 0.62, 0.48),
+    (0.66, 0.46, 0.34),
+)
+_HAIRS = (
+    (0.10, 0.07, 0.05),
+    (0.22, 0.13, 0.07),
+    (0.05, 0.04, 0.04),
+    (0.09, 0.06, 0.05),
+    (0.48, 0.33, 0.17),
+    (0.04, 0.03, 0.03),
+    (0.30, 0.17, 0.09),
+    (0.14, 0.10, 0.08),
+)
+_IRISES = (
+    (0.30, 0.18, 0.09),
+    (0.25, 0.38, 0.48),
+    (0.20, 0.12, 0.07),
+    (0.35, 0.30, 0.14),
+    (0.33, 0.45, 0.50),
+    (0.18, 0.11, 0.07),
+    (0.30, 0.36, 0.22),
+    (0.24, 0.14, 0.08),
+)
+_SHIRTS = (
+    (0.20, 0.32, 0.46),
+    (0.42, 0.18, 0.20),
+    (0.72, 0.70, 0.66),
+    (0.18, 0.36, 0.28),
+    (0.50, 0.42, 0.25),
+    (0.30, 0.30, 0.34),
+    (0.55, 0.30, 0.42),
+    (0.16, 0.20, 0.30),
+)
 _LENGTHS = (0.010, 0.013, 0.005, 0.009, 0.015, 0.004, 0.012, 0.008)
-_TAKES = (("cheek", "chin"), ("cheek", "mouth"), ("chin", "cheek"), ("temple", "cheek"), ("mouth", "temple"), ("cheek", "temple"), ("chin", "mouth"), ("cheek", "chin"))
+_TAKES = (
+    ("cheek", "chin"),
+    ("cheek", "mouth"),
+    ("chin", "cheek"),
+    ("temple", "cheek"),
+    ("mouth", "temple"),
+    ("cheek", "temple"),
+    ("chin", "mouth"),
+    ("cheek", "chin"),
+)
 
 
 def make_subject(name: str, seed: int) -> Subject:
@@ -109,9 +187,17 @@ def make_subject(name: str, seed: int) -> Subject:
     shape[:60] = rng.normal(0, 0.75, 60).clip(-1.6, 1.6)
     shape[60:] = rng.normal(0, 0.3, 40)
     return Subject(
-        name, shape, rng.normal(0, 0.6, 10).clip(-1.2, 1.2), _SKINS[number], _HAIRS[number], _IRISES[number], _SHIRTS[number],
-        _LENGTHS[number], _TAKES[number], int(rng.integers(1 << 31)),
-    )  # fmt: skip
+        name,
+        shape,
+        rng.normal(0, 0.6, 10).clip(-1.2, 1.2),
+        _SKINS[number],
+        _HAIRS[number],
+        _IRISES[number],
+        _SHIRTS[number],
+        _LENGTHS[number],
+        _TAKES[number],
+        int(rng.integers(1 << 31)),
+    )
 
 
 def make_motion(human: Human, subject: Subject, frames: int) -> Motion:
@@ -125,9 +211,16 @@ def make_motion(human: Human, subject: Subject, frames: int) -> Motion:
     cut = int(np.clip(round(0.56 * frames), 2, frames - 2))
     segments = [(0, cut - 1), (cut, frames - 1)]
     motion = Motion(
-        np.zeros((frames, 50)), np.zeros((frames, 3)), np.zeros((frames, 3)), np.zeros((frames, 3)), np.zeros((frames, 45)),
-        np.zeros(frames, int), np.zeros(frames), np.zeros(frames), segments,
-    )  # fmt: skip
+        np.zeros((frames, 50)),
+        np.zeros((frames, 3)),
+        np.zeros((frames, 3)),
+        np.zeros((frames, 3)),
+        np.zeros((frames, 45)),
+        np.zeros(frames, int),
+        np.zeros(frames),
+        np.zeros(frames),
+        segments,
+    )
     bend_axes, spread_axes = hand_axes(human.hand_regressor @ human.hand)
     for take, (first, last) in enumerate(segments):
         rng = np.random.default_rng([subject.seed, take, 29])
@@ -139,14 +232,21 @@ def make_motion(human: Human, subject: Subject, frames: int) -> Motion:
         touch = TOUCHES[subject.touches[take]]
         motion.touch[rows] = take
         motion.expression[rows] = _expressions(human, u, rng)
-        motion.jaw[rows, 0] = 0.01 + 0.2 * np.clip(np.sin(2 * np.pi * (u * rng.uniform(1.0, 1.6) + rng.uniform())), 0, None) ** 2
+        motion.jaw[rows, 0] = (
+            0.01 + 0.2 * np.clip(np.sin(2 * np.pi * (u * rng.uniform(1.0, 1.6) + rng.uniform())), 0, None) ** 2
+        )
         motion.jaw[rows, 1] = 0.02 * _drift(u, rng)
         motion.head_turn[rows] = np.stack([0.10 * _drift(u, rng), 0.28 * _drift(u, rng), 0.08 * _drift(u, rng)], 1)
         motion.head_shift[rows] = np.stack([0.012 * _drift(u, rng) for _ in range(3)], 1)
-        bend = np.array(touch.bend)[None, :, None] + np.array([0.0, 0.12, 0.12, 0.12, 0.02])[None, :, None] * (1 - motion.approach[rows])[:, None, None] / 2
+        bend = (
+            np.array(touch.bend)[None, :, None]
+            + np.array([0.0, 0.12, 0.12, 0.12, 0.02])[None, :, None] * (1 - motion.approach[rows])[:, None, None] / 2
+        )
         bend = bend * np.array([0.7, 1.0, 0.7]) + 0.06 * np.stack([_drift(u, rng) for _ in range(5)], 1)[:, :, None]
         spread = np.zeros((len(u), 5, 3))
-        spread[..., 0] = np.array([0.05, 0.0, -0.12, -0.05, 0.1]) + 0.04 * np.stack([_drift(u, rng) for _ in range(5)], 1)
+        spread[..., 0] = np.array([0.05, 0.0, -0.12, -0.05, 0.1]) + 0.04 * np.stack(
+            [_drift(u, rng) for _ in range(5)], 1
+        )
         pose = bend.reshape(-1, 15, 1) * bend_axes + spread.reshape(-1, 15, 1) * spread_axes
         motion.hand_pose[rows] = pose.reshape(-1, 45)
     return motion
@@ -169,10 +269,19 @@ def _expressions(human: Human, u: np.ndarray, rng: np.random.Generator) -> np.nd
     squint = 0.5 * smile
     blink = np.exp(-(((u - rng.uniform(0.1, 0.9)) / 0.05) ** 2)) * 0.9
     curves = {
-        "mouthSmileLeft": smile, "mouthSmileRight": smile * 0.9, "browInnerUp": brow, "browOuterUpLeft": 0.7 * brow, "browOuterUpRight": 0.8 * brow,
-        "mouthPucker": pucker, "cheekSquintLeft": squint, "cheekSquintRight": squint, "eyeBlinkLeft": blink, "eyeBlinkRight": blink,
-        "mouthUpperUpLeft": 0.3 * np.clip(_drift(u, rng), 0, 1), "mouthLowerDownRight": 0.3 * np.clip(_drift(u, rng), 0, 1),
-    }  # fmt: skip
+        "mouthSmileLeft": smile,
+        "mouthSmileRight": smile * 0.9,
+        "browInnerUp": brow,
+        "browOuterUpLeft": 0.7 * brow,
+        "browOuterUpRight": 0.8 * brow,
+        "mouthPucker": pucker,
+        "cheekSquintLeft": squint,
+        "cheekSquintRight": squint,
+        "eyeBlinkLeft": blink,
+        "eyeBlinkRight": blink,
+        "mouthUpperUpLeft": 0.3 * np.clip(_drift(u, rng), 0, 1),
+        "mouthLowerDownRight": 0.3 * np.clip(_drift(u, rng), 0, 1),
+    }
     out = np.zeros((len(u), 50))
     for name, curve in curves.items():
         out[:, :40] += curve[:, None] * human.units[name]

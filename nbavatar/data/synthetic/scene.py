@@ -83,7 +83,9 @@ def build_bodies(mesh: str) -> Bodies:
     """Builds the body models of one level of detail ("full" or "tiny")."""
     human = load_human(mesh)
     landmarks = landmark_arrays(landmark_content(human), len(human.head_faces), "synthetic landmarks")
-    flame = Flame.build(model_arrays(_unwrapped(flame_content(human)), "synthetic head"), landmarks, dtype=torch.float64)
+    flame = Flame.build(
+        model_arrays(_unwrapped(flame_content(human)), "synthetic head"), landmarks, dtype=torch.float64
+    )
     mano = Mano.build(model_arrays(_unwrapped(mano_content(human)), "synthetic hand"), dtype=torch.float64)
     return Bodies(human, flame, mano)
 
@@ -125,7 +127,11 @@ def make_scene(
     transl = at_stage @ stage_rotation.T + stage_shift - centre
     head_rigid = rotate_about_centroid(as_tensor(canonical), as_tensor(rotation), as_tensor(transl)).numpy()
 
-    rest = bodies.flame.forward(shape, torch.zeros(1, 50, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)).verts[0].numpy()
+    rest = (
+        bodies.flame.forward(shape, torch.zeros(1, 50, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64))
+        .verts[0]
+        .numpy()
+    )
     skin = bodies.skin_faces
     movable = np.zeros(len(rest), bool)
     movable[: human.part_sizes[0]] = True
@@ -141,7 +147,17 @@ def make_scene(
     hand = np.zeros((frames, *human.hand.shape))
     contact_head, contact_hand = np.zeros(head_rigid.shape[:2], bool), np.zeros(hand.shape[:2], bool)
     residual = np.zeros(frames)
-    laid = _Laying(human, canonical, hand_local - wrist[:, None], joints_local - wrist[:, None], skin, movable, motion, subject, press)
+    laid = _Laying(
+        human,
+        canonical,
+        hand_local - wrist[:, None],
+        joints_local - wrist[:, None],
+        skin,
+        movable,
+        motion,
+        subject,
+        press,
+    )
     for n in progress(range(frames)):
         hand_to_head, shift, normal = laid.at(n)
         placed = (hand_local[n] - wrist[n]) @ hand_to_head.T
@@ -177,11 +193,25 @@ def make_scene(
     }
     shortened = shorten_tips(as_tensor(joints)).numpy()
     return Scene(
-        bodies, subject, motion, head_rigid, offset, hand, canonical, landmarks, shortened, contact_head, contact_hand, parameters, residual
-    )  # fmt: skip
+        bodies,
+        subject,
+        motion,
+        head_rigid,
+        offset,
+        hand,
+        canonical,
+        landmarks,
+        shortened,
+        contact_head,
+        contact_hand,
+        parameters,
+        residual,
+    )
 
 
-def full_scene(n_frames: int, seed: int = 0, *, mesh: str = "full", name: str = "S2", dents: bool = True) -> MeshSequence:
+def full_scene(
+    n_frames: int, seed: int = 0, *, mesh: str = "full", name: str = "S2", dents: bool = True
+) -> MeshSequence:
     """Posed meshes of one subject for benchmarks and tests.
 
     Args:
@@ -192,16 +222,20 @@ def full_scene(n_frames: int, seed: int = 0, *, mesh: str = "full", name: str = 
         dents: solve the contact; without it the heads are rigid (much faster).
 
     Returns:
-        Parts `head` (deformed) and `right_hand`; extras `head_rigid` (N, V, 3), `contact.head`, `contact.right_hand` (N, V) bool,
-        `deformation.head` (N, V, 3), `segments` (R, 2).
+        Parts `head` (deformed) and `right_hand`; extras `head_rigid` (N, V, 3), `contact.head`, `contact.right_hand`
+        (N, V) bool, `deformation.head` (N, V, 3), `segments` (R, 2).
     """
     scene = make_scene(build_bodies(mesh), name, n_frames, seed, dents=dents)
     human = scene.bodies.human
     rest_head = scene.bodies.flame.forward(
-        torch.from_numpy(scene.subject.shape)[None], torch.zeros(1, 50, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
+        torch.from_numpy(scene.subject.shape)[None],
+        torch.zeros(1, 50, dtype=torch.float64),
+        torch.zeros(1, 3, dtype=torch.float64),
     ).verts[0]
     rest_hand = scene.bodies.mano.forward(
-        torch.from_numpy(scene.subject.betas)[None], torch.zeros(1, 45, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
+        torch.from_numpy(scene.subject.betas)[None],
+        torch.zeros(1, 45, dtype=torch.float64),
+        torch.zeros(1, 3, dtype=torch.float64),
     ).verts[0]
     parts = {
         "head": Part(human.head_faces, rest_head.numpy().astype(np.float32), scene.head.astype(np.float32)),

@@ -1,15 +1,16 @@
 """Per-pixel shading of the synthetic figure: procedural skin, eyes, hair, cloth and room, two lights with soft shadows.
 
-Colours are functions of the rest position (millimetres), so they stick to the surface whatever the mesh's density, and are the
-same from every camera. All in linear light; plain scalar code, compiled.
+Colours are functions of the rest position (millimetres), so they stick to the surface whatever the mesh's density,
+and are the same from every camera. All in linear light; plain scalar code, compiled.
 """
 
 import math
 
-import numba
 import numpy as np
 
-__all__ = ["ARM", "CLOTH", "EYE", "HAIR", "HAND", "SKIN", "draw_room", "hairline", "shade"]
+from nbavatar.data.synthetic.noise import helper, jit, noise, put, smooth_step, white
+
+__all__ = ["ARM", "CLOTH", "EYE", "HAIR", "HAND", "SKIN", "hairline", "shade"]
 
 SKIN, EYE, HAND, HAIR, CLOTH, ARM = range(6)
 """Materials of faces."""
@@ -26,56 +27,8 @@ def _disk(count: int) -> np.ndarray:
 
 _SEARCH, _FILTER = _disk(10), _disk(14)
 
-# No checks for division by zero. One signature a helper: calls with whole numbers would compile it again for each mixture of
-# types, which is most of the time of a first start.
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
-_jit = numba.njit(**_OPTIONS)
 
-
-def _helper(signature: str):
-    return numba.njit(signature, **_OPTIONS)
-
-
-
-@_helper("f8(i8, i8, i8)")
-def _hash(ix, iy, iz):
-    h = (ix * 374761393 + iy * 668265263 + iz * 1440662683) & 0xFFFFFFFF
-    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
-    return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777215.0
-
-
-@_helper("void(f8[:, ::1], i8, f8[::1])")
-def _noise(points, count, out):
-    """Value noise in [-1, 1] on the unit lattice at `points` (count, 3), into `out`.
-
-    One call for all the noises of a material: the function is inlined wherever it is called, and compiling it once instead of
-    twenty times saves most of the start.
-    """
-    for j in range(count):
-        fx, fy, fz = math.floor(points[j, 0]), math.floor(points[j, 1]), math.floor(points[j, 2])
-        ix, iy, iz = int(fx), int(fy), int(fz)
-        u, v, w = points[j, 0] - fx, points[j, 1] - fy, points[j, 2] - fz
-        u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
-        total = 0.0
-        for i in range(8):
-            a, b, c = i & 1, (i >> 1) & 1, i >> 2
-            weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if c else 1 - w)
-            total += weight * _hash(ix + a, iy + b, iz + c)
-        out[j] = 2 * total - 1
-
-
-@_helper("void(f8[:, ::1], i8, f8, f8, f8)")
-def _put(points, i, x, y, z):
-    points[i, 0], points[i, 1], points[i, 2] = x, y, z
-
-
-@_helper("f8(f8, f8, f8)")
-def _step(lo, hi, x):
-    t = min(max((x - lo) / (hi - lo), 0.0), 1.0)
-    return t * t * (3 - 2 * t)
-
-
-@_helper("UniTuple(f8, 2)(f8, f8, f8, f8, f8, f8)")
+@helper("UniTuple(f8, 2)(f8, f8, f8, f8, f8, f8)")
 def _segment(px, py, ax, ay, bx, by):
     """Distance to a segment and the parameter along it."""
     dx, dy = bx - ax, by - ay
@@ -84,7 +37,7 @@ def _segment(px, py, ax, ay, bx, by):
     return math.sqrt(ex * ex + ey * ey), t
 
 
-@_helper("f8(f8, f8, f8)")
+@helper("f8(f8, f8, f8)")
 def hairline(x, y, z):
     """How far above the hairline [mm], for the head's rest position."""
     if z > 0:
@@ -104,29 +57,31 @@ def hairline(x, y, z):
     return y - line
 
 
-@_jit
-def _skin(x, y, z, tone, hair, lips, brow, seed, points, noise, out):
+@jit
+def _skin(x, y, z, tone, hair, lips, brow, seed, points, field, out):
     """Colour of the face at rest position (x, y, z) [mm]; returns gloss."""
-    _put(points, 0, x / 22 + seed, y / 22, z / 22)
-    _put(points, 1, x / 7 + seed, y / 7 + 9, z / 7)
-    _put(points, 2, x / 1.7, y / 1.7 + seed, z / 1.7)
-    _put(points, 3, x / 2.6 + 40, y / 2.6 + seed, z / 2.6)
-    _put(points, 4, x / 0.9, y / 6 + seed, 0.0)
-    _put(points, 5, x / 0.7 + 0.5 * y, y / 3.5, seed)
-    _put(points, 6, x / 3, y / 3, z / 3)
-    _noise(points, 7, noise)
-    broad, blotch, pore, freckle = noise[0], noise[1], noise[2], noise[3]
-    red = 0.10 * math.exp(-((abs(x) - 42) ** 2 + (y + 42) ** 2) / (2 * 16.0**2)) + 0.12 * math.exp(-(x * x + (y + 36) ** 2) / (2 * 9.0**2)) * _step(20, 34, z)
-    red += 0.16 * _step(66, 76, abs(x)) + 0.05 * max(blotch, 0.0)
+    put(points, 0, x / 22 + seed, y / 22, z / 22)
+    put(points, 1, x / 7 + seed, y / 7 + 9, z / 7)
+    put(points, 2, x / 1.7, y / 1.7 + seed, z / 1.7)
+    put(points, 3, x / 2.6 + 40, y / 2.6 + seed, z / 2.6)
+    put(points, 4, x / 0.9, y / 6 + seed, 0.0)
+    put(points, 5, x / 0.7 + 0.5 * y, y / 3.5, seed)
+    put(points, 6, x / 3, y / 3, z / 3)
+    noise(points, 7, field)
+    broad, blotch, pore, freckle = field[0], field[1], field[2], field[3]
+    red = 0.10 * math.exp(-((abs(x) - 42) ** 2 + (y + 42) ** 2) / (2 * 16.0**2)) + 0.12 * math.exp(
+        -(x * x + (y + 36) ** 2) / (2 * 9.0**2)
+    ) * smooth_step(20, 34, z)
+    red += 0.16 * smooth_step(66, 76, abs(x)) + 0.05 * max(blotch, 0.0)
     light = 1 + 0.06 * broad + 0.05 * blotch + 0.06 * pore
     shade_eye = 0.16 * math.exp(-((abs(x) - 30) ** 2 / (2 * 13.0**2) + (y + 4) ** 2 / (2 * 8.0**2)))
     light *= 1 - shade_eye
-    light *= 1 - 0.35 * _step(0.62, 0.8, freckle) * _step(-65, -10, -abs(y + 25) - abs(x) * 0.3)
+    light *= 1 - 0.20 * smooth_step(0.45, 0.9, freckle) * smooth_step(-65, -10, -abs(y + 25) - abs(x) * 0.3)
     out[0] = tone[0] * light * (1 + red)
     out[1] = tone[1] * light * (1 - 0.9 * red)
     out[2] = tone[2] * light * (1 - 0.9 * red)
-    gloss = 0.35 + 0.35 * math.exp(-(x * x) / (2 * 12.0**2)) * _step(-60, -20, y)
-    front = _step(8, 16, z)
+    gloss = 0.35 + 0.35 * math.exp(-(x * x) / (2 * 12.0**2)) * smooth_step(-60, -20, y)
+    front = smooth_step(8, 16, z)
     # lips: inside the outline, which is given by its upper and lower height over |x|
     n = len(lips)
     ax = abs(x)
@@ -136,19 +91,33 @@ def _skin(x, y, z, tone, hair, lips, brow, seed, points, noise, out):
             i += 1
         t = min(max((ax - lips[i, 0]) / (lips[i + 1, 0] - lips[i, 0]), 0.0), 1.0)
         top, bottom = lips[i, 1] + t * (lips[i + 1, 1] - lips[i, 1]), lips[i, 2] + t * (lips[i + 1, 2] - lips[i, 2])
-        inside = min(min(top - y, y - bottom), lips[n - 1, 0] - ax + 1.0)
-        m = _step(-0.7, 0.9, inside) * front
-        crease = 1 + 0.10 * noise[4]
+        inside = min(top - y, y - bottom, lips[n - 1, 0] - ax + 1.0)
+        m = smooth_step(-0.7, 0.9, inside) * front
+        crease = 1 + 0.10 * field[4]
         out[0] = out[0] * (1 - m) + m * crease * (0.35 * tone[0] + 0.20)
         out[1] = out[1] * (1 - m) + m * crease * 0.42 * tone[1]
         out[2] = out[2] * (1 - m) + m * crease * 0.50 * tone[2]
         gloss += 0.5 * m
-        deep = _step(24, 15, z) * _step(-6, 1, inside) * _step(24, 20, ax)
-        out[0] = out[0] * (1 - deep) + deep * 0.05
-        out[1] = out[1] * (1 - deep) + deep * 0.012
-        out[2] = out[2] * (1 - deep) + deep * 0.012
-    if ax < 24 and abs(y + 76) < 20 and z < 12 and z > -90:
-        out[0], out[1], out[2], gloss = 0.045, 0.01, 0.01, 0.2
+    # inside of the mouth: behind the lips' front, which recedes to the corners; and the whole bag
+    if ax < 27 and y > -97 and y < -56:
+        deep = (
+            smooth_step(30, 26, z + 0.022 * x * x)
+            * smooth_step(-84, -81.5, y)
+            * smooth_step(-63, -66, y)
+            * smooth_step(24, 21, ax)
+        )
+        deep = max(
+            deep,
+            smooth_step(13, 9, z)
+            * smooth_step(27, 23, ax)
+            * smooth_step(-97, -93, y)
+            * smooth_step(-57, -60, y)
+            * smooth_step(-95, -90, z),
+        )
+        gloss *= 1 - 0.7 * deep
+        out[0] = out[0] * (1 - deep) + deep * 0.06
+        out[1] = out[1] * (1 - deep) + deep * 0.014
+        out[2] = out[2] * (1 - deep) + deep * 0.014
     # brows
     if y > 2 and y < 26 and z > -5:
         best, along = 1e9, 0.0
@@ -156,13 +125,13 @@ def _skin(x, y, z, tone, hair, lips, brow, seed, points, noise, out):
             d, t = _segment(ax, y, brow[i, 0], brow[i, 1], brow[i + 1, 0], brow[i + 1, 1])
             if d < best:
                 best, along = d, (i + t) / (len(brow) - 1)
-        strand = noise[5]
-        m = _step(5.4 - 3.0 * along, 1.6 - 0.8 * along, best + 1.1 * strand) * 0.92
+        strand = field[5]
+        m = smooth_step(5.4 - 3.0 * along, 1.6 - 0.8 * along, best + 1.1 * strand) * 0.92
         for c in range(3):
             out[c] = out[c] * (1 - m) + m * hair[c] * 0.7
         gloss *= 1 - 0.7 * m
     # scalp
-    m = _step(-2.5, 2.0, hairline(x, y, z) + 2.2 * noise[6])
+    m = smooth_step(-2.5, 2.0, hairline(x, y, z) + 2.2 * field[6])
     if m > 0:
         for c in range(3):
             out[c] = out[c] * (1 - m) + m * hair[c]
@@ -171,37 +140,37 @@ def _skin(x, y, z, tone, hair, lips, brow, seed, points, noise, out):
     return gloss
 
 
-@_jit
-def _eye(x, y, z, iris, points, noise, out):
+@jit
+def _eye(x, y, z, iris, points, field, out):
     """Colour of an eyeball at unit direction (x, y, z) from its centre; z looks ahead."""
     r = math.sqrt(x * x + y * y) if z > 0 else 1.0
     angle = math.atan2(y, x)
-    _put(points, 0, x * 9, y * 9, z * 5)
-    _put(points, 1, angle * 5.0, r * 9, 3.0)
-    _noise(points, 2, noise)
-    vein = max(noise[0] - 0.25, 0.0) * _step(0.42, 0.9, r)
+    put(points, 0, x * 9, y * 9, z * 5)
+    put(points, 1, angle * 5.0, r * 9, 3.0)
+    noise(points, 2, field)
+    vein = max(field[0] - 0.25, 0.0) * smooth_step(0.42, 0.9, r)
     out[0], out[1], out[2] = 0.74, 0.70 - 0.35 * vein, 0.66 - 0.35 * vein
-    m = _step(0.405, 0.375, r)
-    ray = 1 + 0.3 * noise[1]
-    rim = 1 - 0.6 * _step(0.31, 0.39, r)
+    m = smooth_step(0.405, 0.375, r)
+    ray = 1 + 0.3 * field[1]
+    rim = 1 - 0.6 * smooth_step(0.31, 0.39, r)
     for c in range(3):
         out[c] = out[c] * (1 - m) + m * iris[c] * ray * rim
-    m = _step(0.155, 0.135, r)
+    m = smooth_step(0.155, 0.135, r)
     for c in range(3):
         out[c] = out[c] * (1 - m) + m * 0.008
 
 
-@_jit
-def _hand_skin(x, y, z, ny, tone, nails, knuckles, seed, points, noise, out):
+@jit
+def _hand_skin(x, y, z, ny, tone, nails, knuckles, seed, points, field, out):
     """Colour of the hand at rest position [mm]; `ny` > 0 on its back; returns gloss."""
-    _put(points, 0, x / 15 + seed, y / 15, z / 15)
-    _put(points, 1, x / 1.5, y / 1.5, z / 1.5 + seed)
-    _put(points, 2, x / 40 + 3, 0.0, z / 9 + seed)
-    _put(points, 3, x / 0.9, z / 7, y / 7)
-    _noise(points, 4, noise)
-    broad, pore = noise[0], noise[1]
-    vein = math.exp(-(noise[2] ** 2) / 0.02) * _step(0.3, 0.8, ny) * _step(-10, 30, x)
-    palm = _step(0.2, -0.5, ny)
+    put(points, 0, x / 15 + seed, y / 15, z / 15)
+    put(points, 1, x / 1.5, y / 1.5, z / 1.5 + seed)
+    put(points, 2, x / 40 + 3, 0.0, z / 9 + seed)
+    put(points, 3, x / 0.9, z / 7, y / 7)
+    noise(points, 4, field)
+    broad, pore = field[0], field[1]
+    vein = math.exp(-(field[2] ** 2) / 0.02) * smooth_step(0.3, 0.8, ny) * smooth_step(-10, 30, x)
+    palm = smooth_step(0.2, -0.5, ny)
     light = 1 + 0.05 * broad + 0.06 * pore + 0.10 * palm - 0.10 * vein
     red = 0.06 * palm
     crease = 0.0
@@ -210,18 +179,26 @@ def _hand_skin(x, y, z, ny, tone, nails, knuckles, seed, points, noise, out):
         d2 = dx * dx + dz * dz + (y - knuckles[i, 1]) ** 2
         if d2 < 300:
             red += 0.12 * math.exp(-d2 / 90)
-            crease = max(crease, math.exp(-d2 / 60) * max(noise[3], 0.0))
+            crease = max(crease, math.exp(-d2 / 60) * max(field[3], 0.0))
     light *= 1 - 0.3 * crease
-    out[0], out[1], out[2] = tone[0] * light * (1 + red), tone[1] * light * (1 - 0.8 * red), tone[2] * light * (1 - 0.8 * red)
+    out[0], out[1], out[2] = (
+        tone[0] * light * (1 + red),
+        tone[1] * light * (1 - 0.8 * red),
+        tone[2] * light * (1 - 0.8 * red),
+    )
     gloss = 0.3
     for i in range(len(nails)):
         dx, dy, dz = x - nails[i, 0], y - nails[i, 1], z - nails[i, 2]
         a = dx * nails[i, 3] + dy * nails[i, 4] + dz * nails[i, 5]
         h = dx * nails[i, 6] + dy * nails[i, 7] + dz * nails[i, 8]
         s2 = max(dx * dx + dy * dy + dz * dz - a * a - h * h, 0.0)
-        m = _step(1.15, 0.9, (a / 6.0) ** 2 + s2 / 4.6**2) * _step(0.3, 2.2, h)
+        m = (
+            smooth_step(1.15, 0.9, (a / 6.0) ** 2 + s2 / 4.8**2)
+            * smooth_step(-2.5, -0.5, h)
+            * smooth_step(0.1, 0.4, ny)
+        )
         if m > 0:
-            tip = _step(3.6, 4.6, a)
+            tip = smooth_step(3.6, 4.6, a)
             out[0] = out[0] * (1 - m) + m * (0.66 + 0.12 * tip) * (0.5 + 0.55 * tone[0])
             out[1] = out[1] * (1 - m) + m * (0.42 + 0.28 * tip) * (0.5 + 0.55 * tone[1])
             out[2] = out[2] * (1 - m) + m * (0.38 + 0.28 * tip) * (0.5 + 0.55 * tone[2])
@@ -229,57 +206,7 @@ def _hand_skin(x, y, z, ny, tone, nails, knuckles, seed, points, noise, out):
     return gloss
 
 
-@_jit
-def _room(ox, oy, oz, dx, dy, dz, points, noise, out):
-    """A studio seen from inside: stage axes [m]."""
-    best, axis = 1e9, 0
-    lo, hi = (-1.9, -0.75, -1.5), (2.1, 2.0, 4.0)
-    o, d = (ox, oy, oz), (dx, dy, dz)
-    for a in range(3):
-        if abs(d[a]) > 1e-9:
-            t = ((hi[a] if d[a] > 0 else lo[a]) - o[a]) / d[a]
-            if t > 0 and t < best:
-                best, axis = t, a
-    x, y, z = ox + best * dx, oy + best * dy, oz + best * dz
-    _put(points, 0, x * 25, y * 25, z * 25)
-    _noise(points, 1, noise)
-    grain = 1 + 0.05 * noise[0]
-    if axis == 1:
-        board = _hash(int(math.floor(x * 6)), 7, 3)
-        out[0], out[1], out[2] = 0.20 + 0.06 * board, 0.14 + 0.04 * board, 0.10 + 0.03 * board
-    elif axis == 2:
-        panel = 1 - 0.45 * _step(0.47, 0.49, abs(x * 1.1 - math.floor(x * 1.1) - 0.5)) - 0.3 * _step(0.48, 0.495, abs(y * 0.9 + 0.3 - math.floor(y * 0.9 + 0.3) - 0.5))
-        glow = math.exp(-((x - 0.7) ** 2 + (y - 1.2) ** 2) / 0.5)
-        out[0], out[1], out[2] = panel * (0.20 + 0.22 * glow), panel * (0.25 + 0.22 * glow), panel * (0.29 + 0.20 * glow)
-    else:
-        shelf = _step(0.46, 0.48, abs(y * 2.2 - math.floor(y * 2.2) - 0.5))
-        book = _hash(int(math.floor(z * 14)), int(math.floor(y * 2.2)), 5)
-        out[0] = 0.10 + 0.30 * book * (1 - shelf)
-        out[1] = 0.09 + 0.22 * _hash(int(math.floor(z * 14)), int(math.floor(y * 2.2)), 8) * (1 - shelf)
-        out[2] = 0.08 + 0.20 * _hash(int(math.floor(z * 14)), int(math.floor(y * 2.2)), 2) * (1 - shelf)
-    for c in range(3):
-        out[c] *= grain
-
-
-@_jit
-def draw_room(k, cam_from_stage, image):
-    """Fills `image` (H, W, 3) float32, linear light, with the empty room; `k` (4,) fx fy cx cy [px]."""
-    height, width = image.shape[:2]
-    r, t = cam_from_stage[:3, :3], cam_from_stage[:3, 3]
-    ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
-    oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
-    oz = -(r[0, 2] * t[0] + r[1, 2] * t[1] + r[2, 2] * t[2])
-    colour, points, noise = np.zeros(3), np.zeros((8, 3)), np.zeros(8)
-    for py in range(height):
-        for px in range(width):
-            x, y = (px + 0.5 - k[2]) / k[0], (py + 0.5 - k[3]) / k[1]
-            dx, dy, dz = r[0, 0] * x + r[1, 0] * y + r[2, 0], r[0, 1] * x + r[1, 1] * y + r[2, 1], r[0, 2] * x + r[1, 2] * y + r[2, 2]
-            _room(ox, oy, oz, dx, dy, dz, points, noise, colour)
-            for c in range(3):
-                image[py, px, c] = colour[c]
-
-
-@_jit
+@jit
 def _lit(px, py, pz, nx, ny, nz, light, k, from_world, depth, cosine, sine):
     """Share of a light that reaches a point: blocker search, then a filter as wide as the penumbra."""
     qx, qy, qz = px + nx * 0.0022, py + ny * 0.0022, pz + nz * 0.0022
@@ -309,20 +236,20 @@ def _lit(px, py, pz, nx, ny, nz, light, k, from_world, depth, cosine, sine):
     return lit / len(_FILTER)
 
 
-@_jit
+@jit
 def shade(
     face_id, bary, faces, verts, normals, rest, dorsal, occlusion, material, eye, up, lights, light_k,
     light_from_world, light_depth, colours, lips, brow, eyes, nails, knuckles, seed, image,
-):  # fmt: skip  # noqa: PLR0913, PLR0915
+):  # fmt: skip
     """Colours of the pixels that see the figure, written into `image` (H, W, 3) float32, linear light.
 
-    `face_id`, `bary` come from the z-buffer; `verts`, `normals` (V, 3) world; `rest` (V, 3) [mm]; `dorsal` (V,) up-component of the
-    rest normal (1 on the back of the hand); `occlusion` (V,) share of ambient
-    light; `material` (F,); `eye` (3,) the camera's place and `up` (3,), world; `lights` (L, 7): position, radius [m], colour; `colours` (6, 3): skin, hair, iris,
-    shirt, ambient above and below.
+    `face_id`, `bary` come from the z-buffer; `verts`, `normals` (V, 3) world; `rest` (V, 3) [mm]; `dorsal` (V,) up-
+    component of the rest normal (1 on the back of the hand); `occlusion` (V,) share of ambient
+    light; `material` (F,); `eye` (3,) the camera's place and `up` (3,), world; `lights` (L, 7): position, radius [m],
+    colour; `colours` (6, 3): skin, hair, iris, shirt, ambient above and below.
     """
     height, width = face_id.shape
-    colour, points, noise = np.zeros(3), np.zeros((8, 3)), np.zeros(8)
+    colour, points, field = np.zeros(3), np.zeros((8, 3)), np.zeros(8)
     for py in range(height):
         for px in range(width):
             f = face_id[py, px]
@@ -352,38 +279,38 @@ def shade(
             kind = material[f]
             gloss, power, wrap = 0.3, 18.0, 0.25
             if kind == SKIN:
-                gloss = _skin(rx, ry, rz, colours[0], colours[1], lips, brow, seed, points, noise, colour)
+                gloss = _skin(rx, ry, rz, colours[0], colours[1], lips, brow, seed, points, field, colour)
             elif kind == EYE:
                 side = 0 if rx > 0 else 1
                 ex, ey, ez = rx - eyes[side, 0], ry - eyes[side, 1], rz - eyes[side, 2]
                 size = max(math.sqrt(ex * ex + ey * ey + ez * ez), 1e-9)
-                _eye(ex / size, ey / size, ez / size, colours[2], points, noise, colour)
+                _eye(ex / size, ey / size, ez / size, colours[2], points, field, colour)
                 gloss, power, wrap = 6.0, 300.0, 0.1
                 ambient *= 0.75
             elif kind == HAND:
                 back = w0 * dorsal[a] + w1 * dorsal[b] + w2 * dorsal[c_]
-                gloss = _hand_skin(rx, ry, rz, back, colours[0], nails, knuckles, seed, points, noise, colour)
+                gloss = _hand_skin(rx, ry, rz, back, colours[0], nails, knuckles, seed, points, field, colour)
             else:
                 # hair, cloth and the arm's skin: a base colour and two noises, fine and coarse
                 if kind == HAIR:
-                    _put(points, 0, rx / 1.1 + 0.12 * ry, ry / 14, rz / 1.1 + 0.12 * ry)
-                    _put(points, 1, rx / 4, ry / 20, rz / 4)
+                    put(points, 0, rx / 1.1 + 0.12 * ry, ry / 14, rz / 1.1 + 0.12 * ry)
+                    put(points, 1, rx / 4, ry / 20, rz / 4)
                 elif kind == CLOTH:
-                    _put(points, 0, rx / 1.6, ry / 1.6, rz / 1.6)
-                    _put(points, 1, rx / 30, ry / 12, rz / 30)
+                    put(points, 0, rx / 1.6, ry / 1.6, rz / 1.6)
+                    put(points, 1, rx / 30, ry / 12, rz / 30)
                 else:
-                    _put(points, 0, rx / 1.7, ry / 1.7, rz / 1.7)
-                    _put(points, 1, rx / 18, ry / 18, rz / 18)
-                _noise(points, 2, noise)
+                    put(points, 0, rx / 1.7, ry / 1.7, rz / 1.7)
+                    put(points, 1, rx / 18, ry / 18, rz / 18)
+                noise(points, 2, field)
                 if kind == HAIR:
-                    strand = noise[0] + 0.5 * noise[1]
+                    strand = field[0] + 0.5 * field[1]
                     base, factor = 1, max(1 + 0.55 * strand, 0.1)
                     gloss, power, wrap = 0.5 + 0.4 * strand, 24.0, 0.1
                 elif kind == CLOTH:
-                    base, factor = 3, 1 + 0.10 * noise[0] + 0.12 * noise[1]
+                    base, factor = 3, 1 + 0.10 * field[0] + 0.12 * field[1]
                     gloss, power, wrap = 0.02, 6.0, 0.15
                 else:
-                    base, factor = 0, 1 + 0.05 * noise[0] + 0.05 * noise[1]
+                    base, factor = 0, 1 + 0.05 * field[0] + 0.05 * field[1]
                 for c in range(3):
                     colour[c] = colours[base, c] * factor
             sky = 0.5 + 0.5 * (nx * up[0] + ny * up[1] + nz * up[2])
@@ -391,7 +318,7 @@ def shade(
             lg = ambient * (sky * colours[4, 1] + (1 - sky) * colours[5, 1])
             lb = ambient * (sky * colours[4, 2] + (1 - sky) * colours[5, 2])
             sr = sg = sb = 0.0
-            spin = 6.2831853 * _hash(px, py, 1)
+            spin = 6.2831853 * white(px, py, 1)
             spin_c, spin_s = math.cos(spin), math.sin(spin)
             for i in range(len(lights)):
                 lx, ly, lz = lights[i, 0] - x, lights[i, 1] - y, lights[i, 2] - z
@@ -403,7 +330,9 @@ def shade(
                     continue
                 lit = 1.0
                 if cosine > -0.15:
-                    lit = _lit(x, y, z, nx, ny, nz, lights[i], light_k[i], light_from_world[i], light_depth[i], spin_c, spin_s)
+                    lit = _lit(
+                        x, y, z, nx, ny, nz, lights[i], light_k[i], light_from_world[i], light_depth[i], spin_c, spin_s
+                    )
                 elif cosine <= -0.15:
                     lit = 0.6
                 # the edge of a shadow on skin is warm: red light scatters furthest

@@ -1,4 +1,5 @@
-"""The studio: calibrated cameras with lens distortion, two lights with shadow maps, and the picture that a camera takes."""
+"""The studio: calibrated cameras with lens distortion, two lights with shadow maps, and the picture that a camera
+takes."""
 
 import dataclasses
 
@@ -7,8 +8,9 @@ import numpy as np
 from nbavatar.camera.distortion import undistort_pixels
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.synthetic.figure import Figure
+from nbavatar.data.synthetic.room import draw_room
 from nbavatar.data.synthetic.scene import STAGE_TO_WORLD
-from nbavatar.data.synthetic.shading import draw_room, shade
+from nbavatar.data.synthetic.shading import shade
 from nbavatar.mesh.zbuffer import rasterize_mesh
 
 __all__ = ["Lens", "Lights", "lens_of", "light_up", "make_cameras", "photograph"]
@@ -16,14 +18,22 @@ __all__ = ["Lens", "Lights", "lens_of", "light_up", "make_cameras", "photograph"
 _TARGET = np.array([-0.01, 0.775, 0.06])
 # azimuth (positive: from the subject's left), elevation [degrees], distance [m]
 _PLACES = {
-    "084": (-52.0, 4.0, 1.32), "100": (-34.0, 16.0, 1.30), "102": (-17.0, -7.0, 1.28), "108": (1.0, 5.0, 1.30),
-    "110": (17.0, -6.0, 1.29), "111": (-8.0, 24.0, 1.34), "121": (36.0, 12.0, 1.31), "122": (58.0, 3.0, 1.33),
-}  # fmt: skip
+    "084": (-52.0, 4.0, 1.32),
+    "100": (-34.0, 16.0, 1.30),
+    "102": (-17.0, -7.0, 1.28),
+    "108": (1.0, 5.0, 1.30),
+    "110": (17.0, -6.0, 1.29),
+    "111": (-8.0, 24.0, 1.34),
+    "121": (36.0, 12.0, 1.31),
+    "122": (58.0, 3.0, 1.33),
+}
 # position on the stage [m], radius [m], colour
-_LIGHTS = np.array([
-    [-1.15, 1.75, 1.75, 0.09, 1.28, 1.18, 1.05],
-    [1.45, 1.15, 1.55, 0.22, 0.42, 0.46, 0.54],
-])  # fmt: skip
+_LIGHTS = np.array(
+    [
+        [-1.15, 1.75, 1.75, 0.09, 1.28, 1.18, 1.05],
+        [1.45, 1.15, 1.55, 0.22, 0.42, 0.46, 0.54],
+    ]
+)
 _SHADOW_REACH = 0.42
 
 
@@ -113,7 +123,7 @@ def lens_of(camera: Camera, supersample: int) -> Lens:
 
 
 def _room(camera: Camera, K: np.ndarray, width: int, height: int) -> np.ndarray:
-    image = np.empty((height, width, 3), np.float32)
+    image = np.zeros((height, width, 3), np.float32)
     draw_room(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), camera.cam_from_world @ STAGE_TO_WORLD, image)
     return image
 
@@ -162,14 +172,34 @@ def photograph(
     camera, looks, s = lens.camera, figure.looks, lens.supersample
     face_id, bary, _ = rasterize_mesh(
         verts, figure.faces, lens.K, lens.width, lens.height, cam_from_world=camera.cam_from_world, workers=1
-    )  # fmt: skip
+    )
     image = lens.room.copy()
     eye = -camera.cam_from_world[:3, :3].T @ camera.cam_from_world[:3, 3]
     shade(
-        face_id, bary, figure.faces, verts, normals, figure.rest, figure.dorsal, ambient, figure.material, eye, STAGE_TO_WORLD[:3, 1].copy(),
-        lights.lights, lights.k, lights.from_world, lights.depth, looks.colours, looks.lips, looks.brow, looks.eyes, looks.nails,
-        looks.knuckles, looks.seed, image,
-    )  # fmt: skip
+        face_id,
+        bary,
+        figure.faces,
+        verts,
+        normals,
+        figure.rest,
+        figure.dorsal,
+        ambient,
+        figure.material,
+        eye,
+        STAGE_TO_WORLD[:3, 1].copy(),
+        lights.lights,
+        lights.k,
+        lights.from_world,
+        lights.depth,
+        looks.colours,
+        looks.lips,
+        looks.brow,
+        looks.eyes,
+        looks.nails,
+        looks.knuckles,
+        looks.seed,
+        image,
+    )
     person = (face_id >= 0).astype(np.float32)
     if lens.maps is not None:
         import cv2

@@ -22,8 +22,13 @@ from nbavatar.mesh.zbuffer import rasterize_mesh
 
 FRAMES, WIDTH, HEIGHT = 8, 96, 54
 OPTIONS = {
-    "cameras": ("084", "108", "122"), "frames": FRAMES, "width": WIDTH, "height": HEIGHT, "mesh": "tiny", "supersample": 2,
-}  # fmt: skip
+    "cameras": ("084", "108", "122"),
+    "frames": FRAMES,
+    "width": WIDTH,
+    "height": HEIGHT,
+    "mesh": "tiny",
+    "supersample": 2,
+}
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +60,12 @@ def _meshes(root: Path, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 
     rotation = axis_angle_to_matrix(stack("head", "global_orient"))
     verts = flame.forward_decaf(
-        stack("head", "shape_params"), stack("head", "expression_params"), stack("head", "pose_params")[:, 3:],
-        stack("head", "global_orient"), stack("head", "transl"),
-    ).numpy()  # fmt: skip
+        stack("head", "shape_params"),
+        stack("head", "expression_params"),
+        stack("head", "pose_params")[:, 3:],
+        stack("head", "global_orient"),
+        stack("head", "transl"),
+    ).numpy()
     deform = np.load(base / "deformations" / name / "deforms.npy").astype(np.float64)
     deform[:, np.load(assets / "FLAME_neck_idx.npy")] = 0
     head = verts - np.einsum("nij,nvj->nvi", rotation.numpy(), deform)
@@ -73,7 +81,12 @@ def test_the_tree_is_the_releases(root: Path, name: str) -> None:
         for folder in ("videos", "segmentations"):
             info = probe_video(base / folder / name / f"{camera}.mp4")
             assert (info.width, info.height, info.count) == (WIDTH, HEIGHT, FRAMES)
-        for folder, shape in (("head_keys", (68, 3)), ("right_hand_keys", (21, 3)), ("head_bbs", (4,)), ("right_hand_bbs", (4,))):
+        for folder, shape in (
+            ("head_keys", (68, 3)),
+            ("right_hand_keys", (21, 3)),
+            ("head_bbs", (4,)),
+            ("right_hand_bbs", (4,)),
+        ):
             array = np.load(base / folder / name / f"{camera}.npy")
             assert array.shape == (FRAMES, *shape) and np.isfinite(array).all()
     assert np.load(base / "deformations" / name / "deforms.npy").shape == (FRAMES, 612, 3)
@@ -91,7 +104,9 @@ def test_the_tree_is_the_releases(root: Path, name: str) -> None:
         assert {p: {k: v.shape for k, v in d.items()} for p, d in frame.items()} == {
             p: {k: (n,) for k, n in d.items()} for p, d in sizes.items()
         }
-    rotation = axis_angle_to_matrix(torch.from_numpy(np.stack([stored[str(n)]["head"]["global_orient"] for n in range(FRAMES)]).astype(np.float64)))
+    rotation = axis_angle_to_matrix(
+        torch.from_numpy(np.stack([stored[str(n)]["head"]["global_orient"] for n in range(FRAMES)]).astype(np.float64))
+    )
     np.testing.assert_allclose(poses[:, :3, :3], rotation.numpy(), atol=1e-6)  # parameters are float32
     (cut,) = read_pickle(base / "cutIDs" / f"{name}.pkl")
     assert cut[1] == cut[0] + 1 and 0 <= cut[0] < FRAMES - 1
@@ -111,8 +126,8 @@ def test_the_tree_is_the_releases(root: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["S2", "S3"])
 def test_models_project_onto_the_keypoints(root: Path, name: str) -> None:
-    """Without noise every keypoint that is there is the projection of its landmark: parameters, deformation sign and frame,
-    distortion and tip shortening all have to be right for that."""
+    """Without noise every keypoint that is there is the projection of its landmark: parameters, deformation sign and
+    frame, distortion and tip shortening all have to be right for that."""
     base, _ = _subject(root, name)
     _, _, landmarks, joints = _meshes(root, name)
     cameras = read_pickle(base / "cameras" / name / "cameras.pkl")
@@ -143,8 +158,13 @@ def test_masks_show_the_whole_person(root: Path, name: str) -> None:
     bent = distort_pixels(np.stack([x, y], -1), camera["intrinsic"], camera["distortion"])
     for n in range(FRAMES):
         seen = rasterize_mesh(
-            np.concatenate([head[n], hand[n]]), faces, camera["intrinsic"], WIDTH, HEIGHT, cam_from_world=np.array(camera["extrinsic"])
-        )[0]  # fmt: skip
+            np.concatenate([head[n], hand[n]]),
+            faces,
+            camera["intrinsic"],
+            WIDTH,
+            HEIGHT,
+            cam_from_world=np.array(camera["extrinsic"]),
+        )[0]
         rows, columns = np.nonzero(seen >= 0)
         at = np.floor(bent[rows, columns]).astype(int)
         inside = (at[:, 0] >= 0) & (at[:, 0] < WIDTH) & (at[:, 1] >= 0) & (at[:, 1] < HEIGHT)
@@ -162,7 +182,9 @@ def test_the_hand_touches_in_both_takes_and_boxes_go_missing(root: Path) -> None
     (cut,) = read_pickle(base / "cutIDs" / "S2.pkl")
     assert contact[: cut[0] + 1].any() and contact[cut[1] :].any()
     assert not contact[0].any()
-    boxes = np.concatenate([np.load(base / f"{p}_bbs" / "S2" / f"{c}.npy") for p in ("head", "right_hand") for c in OPTIONS["cameras"]])
+    boxes = np.concatenate(
+        [np.load(base / f"{p}_bbs" / "S2" / f"{c}.npy") for p in ("head", "right_hand") for c in OPTIONS["cameras"]]
+    )
     gone = (boxes == -1).all(1)
     assert 0 < gone.sum() < len(boxes) / 2
     assert (boxes[~gone] >= 0).all() and (boxes[~gone, 2:] > boxes[~gone, :2]).all()

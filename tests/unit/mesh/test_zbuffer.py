@@ -19,7 +19,8 @@ def _rays() -> np.ndarray:
 
 
 def _cast(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Depth of the nearest crossing of every pixel's ray (inf where none), by Moeller and Trumbore's test on all pairs."""
+    """Depth of the nearest crossing of every pixel's ray (inf where none), by Moeller and Trumbore's test on all
+    pairs."""
     rays = _rays().reshape(-1, 1, 3)
     a, e1, e2 = verts[faces[:, 0]], verts[faces[:, 1]] - verts[faces[:, 0]], verts[faces[:, 2]] - verts[faces[:, 0]]
     p = np.cross(rays, e2)
@@ -85,7 +86,8 @@ def test_a_sphere_has_the_area_of_its_outline() -> None:
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31 - 1))
 def test_closed_surfaces_have_no_cracks(seed: int) -> None:
-    """Every pixel inside the outline of a fan around a point belongs to exactly one of its triangles, whatever the angle."""
+    """Every pixel inside the outline of a fan around a point belongs to exactly one of its triangles, whatever the
+    angle."""
     rng = np.random.default_rng(seed)
     angle = np.sort(rng.uniform(0, 2 * np.pi, 9))
     rim = np.stack([np.cos(angle), np.sin(angle), 0.4 * rng.normal(size=9)], 1) * 0.3
