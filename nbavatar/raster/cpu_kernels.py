@@ -286,7 +286,8 @@ def traverse(turn, tiles, start, members_, offset_, record_, box, place_, featur
                             begin, end = get(head, pixel), get(tail, pixel)
                             if depth < 0:
                                 while begin < end and get(queue, 4 * (slots + begin) + 2) >= reach:
-                                    _release(pixel, 4 * (slots + begin), get(members, get(who, slots + begin)), queue, through,
+                                    _release(pixel, 4 * (slots + begin), get(members, get(who, slots + begin)),
+                                             queue, through,
                                              sums, features, grads, grad_at, hits, chain, last, counts,
                                              get(who, slots + begin), limits, texels, channels, replay)  # fmt: skip
                                     begin += 1
@@ -311,7 +312,8 @@ def traverse(turn, tiles, start, members_, offset_, record_, box, place_, featur
                             if depth != 0:
                                 while j > begin:
                                     other = get(queue, 4 * (slots + j - 1) + 2)
-                                    if other > key or (other == key and get(place, get(members, get(who, slots + j - 1))) < own_place):
+                                    waiting_place = get(place, get(members, get(who, slots + j - 1)))
+                                    if other > key or (other == key and waiting_place < own_place):
                                         break
                                     move4(queue, 4 * (slots + j), 4 * (slots + j - 1))
                                     put(who, slots + j, get(who, slots + j - 1))
@@ -323,7 +325,8 @@ def traverse(turn, tiles, start, members_, offset_, record_, box, place_, featur
                             put(who, slots + j, entry)
                             end += 1
                             if depth >= 0 and end - begin > depth:
-                                _release(pixel, 4 * (slots + begin), get(members, get(who, slots + begin)), queue, through, sums,
+                                _release(pixel, 4 * (slots + begin), get(members, get(who, slots + begin)), queue,
+                                         through, sums,
                                          features, grads, grad_at, hits, chain, last, counts, get(who, slots + begin),
                                          limits, texels, channels, replay)  # fmt: skip
                                 begin += 1
@@ -349,8 +352,10 @@ def traverse(turn, tiles, start, members_, offset_, record_, box, place_, featur
                     for j in range(get(head, pixel), get(tail, pixel)):
                         if get(through, pixel) < t_min:
                             break
-                        _release(pixel, 4 * (slots + j), get(members, get(who, slots + j)), queue, through, sums, features, grads,
-                                 (y * width + x) * (channels + 1), hits, chain, last, counts, get(who, slots + j), limits,
+                        _release(pixel, 4 * (slots + j), get(members, get(who, slots + j)), queue, through, sums,
+                                 features, grads,
+                                 (y * width + x) * (channels + 1), hits, chain, last, counts, get(who, slots + j),
+                                          limits,
                                  texels, channels, replay)  # fmt: skip
             if replay:
                 for y in range(top, bottom):
@@ -358,7 +363,8 @@ def traverse(turn, tiles, start, members_, offset_, record_, box, place_, featur
                         number = get(last, (y - top) * TILE_WIDTH + x - left)
                         behind = zero
                         while number >= 0:
-                            worth, a, passed = get(hits, 3 * number), get(hits, 3 * number + 1), get(hits, 3 * number + 2)
+                            worth, a = get(hits, 3 * number), get(hits, 3 * number + 1)
+                            passed = get(hits, 3 * number + 2)
                             entry = get(chain, 2 * number)
                             i = get(members, entry)
                             x_first, x_end = max(left, box[i, 0]), min(right, box[i, 2])
