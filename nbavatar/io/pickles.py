@@ -147,7 +147,7 @@ class _Dtype(_Shim):
         if not isinstance(letters, str) or letters[:1] not in _DTYPE_LETTERS:
             raise _Refused(f"numpy dtype {letters!r}")
         dtype = np.dtype(letters)
-        return dtype if self.order in ("|", "=") else dtype.newbyteorder(self.order)
+        return dtype if self.order in ("|", "=") else dtype.newbyteorder(">" if self.order == ">" else "<")
 
 
 class _Array(_Shim):
@@ -203,7 +203,7 @@ def _from_buffer(buffer: Any, dtype: Any, shape: Any, order: str, axis_order: An
     kind = _dtype(dtype)
     if kind.hasobject or axis_order is not None:
         raise _Refused("numpy buffer of object type or permuted axes")
-    return np.frombuffer(buffer, dtype=kind).reshape(shape, order=order)
+    return np.frombuffer(buffer, dtype=kind).reshape(shape, order="F" if order == "F" else "C")
 
 
 def _encode(text: str, encoding: str = "latin1", errors: str = "strict") -> bytes:
