@@ -1,8 +1,8 @@
 """Contact physics: frames a second with and without contact, depth left, volume lost.
 
-A head and a hand of simple shapes, of FLAME's and MANO's vertex counts by default. The fingers press the cheek 2 to 20 mm
-deep, slide, and let go; then they hover. --meshes takes a mesh sequence of your own instead. Frames run one after the other
-in one thread, as in the pipeline.
+A head and a hand of simple shapes, of FLAME's and MANO's vertex counts by default. The fingers press the cheek 2 to
+20 mm deep, slide, and let go; then they hover. --meshes takes a mesh sequence of your own instead. Frames run one
+after the other in one thread, as in the pipeline.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Spectral coordinates of a head and two hands (simple shapes of FLAME's and MANO's vertex counts, or your own meshes)."""
+"""Spectral coordinates of a head and two hands: simple shapes of FLAME's and MANO's size, or your own meshes."""
 
 import argparse
 import time

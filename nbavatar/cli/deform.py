@@ -237,7 +237,7 @@ def _validate(result: MeshSequence, hands: list[str]) -> dict[str, object]:
     }
     reference = result.extras.get("reference.deformation.head")
     if reference is not None:
-        labels = result.extras.get("reference.contact.head", np.linalg.norm(reference, axis=-1) > 1e-4)
+        labels = np.asarray(result.extras.get("reference.contact.head", np.linalg.norm(reference, axis=-1) > 1e-4))
         agreement = compare_deformation(
             head.verts - rigid, reference, result.extras["contact.head"], labels.astype(bool)
         )

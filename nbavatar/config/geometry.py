@@ -67,9 +67,9 @@ class DeformConfig:
 
     stiffness: str = option(
         "auto",
-        "Stiffness under the skin: the user's array `stiffness.head` in the meshes [N/m^3] (data), from the distance to "
-        "a skull proxy (anatomical), or the same everywhere (uniform); auto takes data where there is some, else "
-        "anatomical.",
+        "Stiffness under the skin: the user's array `stiffness.head` in the meshes [N/m^3] (data), from the "
+        "distance to a skull proxy (anatomical), or the same everywhere (uniform); auto takes data where there "
+        "is some, else anatomical.",
         choices=("auto", "data", "anatomical", "uniform"),
     )
     modulus: float = option(1.0e4, "Young's modulus of soft tissue [Pa].", min=0.0, max=1.0e12)
@@ -80,7 +80,7 @@ class DeformConfig:
         min=0.0, max=1.0e12,
     )  # fmt: skip
     bending: float = option(1.0e-5, "Flexural rigidity of the skin [N m].", min=0.0, max=1.0e12)
-    volume: float = option(2.0e8, "Resistance of the pressed region to loss of volume [N/m^5].", min=0.0, max=1.0e18)
+    volume: float = option(3.0e8, "Resistance of the pressed region to loss of volume [N/m^5].", min=0.0, max=1.0e18)
     friction: float = option(0.3, "Coulomb friction of a hand on skin.", min=0.0, max=10.0)
     reach: float = option(0.05, "How far from a contact the skin moves, along the surface [m].", min=0.0, max=1.0)
     max_dent: float = option(0.035, "Longest way a point of the skin may move [m].", min=0.0, max=1.0)

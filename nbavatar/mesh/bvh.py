@@ -20,6 +20,8 @@ _LEAF = 4
 _STACK = 64
 # A cluster farther than this many of its radii is taken as one dipole.
 _FAR = 2.0
+# For so few points the clusters do not pay: the sum is taken over all faces.
+_FEW = 4
 
 
 class DeformingMesh:
@@ -120,6 +122,8 @@ class DeformingMesh:
 
     def winding(self, points: np.ndarray) -> np.ndarray:
         """Generalised winding number of each point (P, 3) [m], with holes closed; (P,) float64."""
+        if len(points) <= _FEW:
+            return _winding_plain(np.ascontiguousarray(points), self.verts, self._all_faces)
         if not self._charged:
             self._fit()
             _charge(self.verts, self._all_faces, self._order, self._nodes, self._bounds, self._dipoles)
@@ -428,6 +432,17 @@ def _winding(points, verts, faces, order, nodes, dipoles):
                     total += _solid_angle(p0, p1, p2, verts[faces[f, 0]], verts[faces[f, 1]], verts[faces[f, 2]])
         result[i] = total / (4.0 * math.pi)
     return result
+
+
+@numba.njit(cache=True)
+def _winding_plain(points, verts, faces):
+    result = np.zeros(len(points))
+    for i in range(len(points)):
+        for f in range(len(faces)):
+            result[i] += _solid_angle(
+                points[i, 0], points[i, 1], points[i, 2], verts[faces[f, 0]], verts[faces[f, 1]], verts[faces[f, 2]]
+            )
+    return result / (4.0 * math.pi)
 
 
 @numba.njit(cache=True)

@@ -1,5 +1,9 @@
 """Pictures of meshes from chosen sides, for people to look at: shaded, coloured by vertex values."""
 
+from collections.abc import Callable
+
+from collections.abc import Callable
+
 import numpy as np
 
 from nbavatar.mesh.zbuffer import rasterize_mesh
@@ -53,7 +57,12 @@ def signed_colors(values: np.ndarray) -> np.ndarray:
 
 
 def draw_mesh(
-    verts: np.ndarray, faces: np.ndarray, colors: np.ndarray, K: np.ndarray, pose: np.ndarray, size: int
+    verts: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray | Callable[[np.ndarray, np.ndarray], np.ndarray],
+    K: np.ndarray,
+    pose: np.ndarray,
+    size: int,
 ) -> np.ndarray:
     """Shaded picture of a mesh on white.
 

@@ -65,4 +65,4 @@ def cotangent_laplacian(verts: np.ndarray, faces: np.ndarray) -> tuple[scipy.spa
     ).tocsc()
     diagonal = -np.asarray(off.sum(axis=1)).ravel()
     mass = np.bincount(faces.ravel(), np.repeat(double_area / 6.0, 3), minlength=len(verts))
-    return (off + scipy.sparse.diags(diagonal)).tocsc(), mass
+    return scipy.sparse.csc_matrix(off + scipy.sparse.diags(diagonal)), mass

@@ -153,7 +153,8 @@ def _smallest(matrix: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    inverse = scipy.sparse.linalg.LinearOperator(matrix.shape, matvec=factor.solve, dtype=np.float64)
+    solve: Any = scipy.sparse.linalg.LinearOperator
+    inverse = solve(matrix.shape, matvec=factor.solve, dtype=np.float64)
     values, vectors = scipy.sparse.linalg.eigsh(
         matrix, count, sigma=shift, OPinv=inverse, v0=np.sin(1.0 + np.arange(n)), tol=0
     )

@@ -2,9 +2,8 @@
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 
 from nbavatar.mesh.bvh import DeformingMesh, surface_points
 
@@ -84,8 +83,8 @@ def estimate_overlap(
     """`measure_overlap`, several times faster.
 
     Near the surface the side is told by pseudonormals. Vertices farther away than half the longest edge are on the same
-    side as their neighbours that are far too, as no edge between them can cross the surface: one winding number for each
-    connected group.
+    side as their neighbours that are far too, as no edge between them can cross the surface: one winding number for
+    each connected group.
 
     Args:
         edges: edges of head and hand, (E, 2) and (Eh, 2) int64; the rest as in `measure_overlap`.
@@ -128,11 +127,9 @@ def _quick(mesh: DeformingMesh, points: np.ndarray, edges: np.ndarray, radius: f
     far = (face < 0) & ((points >= low) & (points <= high)).all(axis=1)
     depth[face < 0] = 0.0
     if far.any():
-        joined = edges[far[edges].all(axis=1)]
-        graph = scipy.sparse.coo_matrix((np.ones(len(joined), np.int8), joined.T), shape=(len(points),) * 2)
-        _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        group = _groups(far, edges)
         ids = np.flatnonzero(far)
-        groups, first, inverse = np.unique(group[ids], return_index=True, return_inverse=True)
+        _, first, inverse = np.unique(group[ids], return_index=True, return_inverse=True)
         inside = mesh.inside(np.ascontiguousarray(points[ids[first]]))[inverse]
         if inside.any():
             deep = ids[inside]
@@ -151,6 +148,25 @@ def _depths(mesh: DeformingMesh, points: np.ndarray, radius: float) -> tuple[np.
     return np.where(inside, distance, 0.0), distance
 
 
+@numba.njit(cache=True)
+def _groups(member, edges):
+    """A label for each vertex: equal for members joined by edges between members (union-find)."""
+    parent = np.arange(len(member))
+    for e in range(len(edges)):
+        a, b = edges[e, 0], edges[e, 1]
+        if member[a] and member[b]:
+            while parent[a] != a:
+                parent[a] = parent[parent[a]]
+                a = parent[a]
+            while parent[b] != b:
+                parent[b] = parent[parent[b]]
+                b = parent[b]
+            parent[max(a, b)] = min(a, b)
+    for v in range(len(member)):
+        parent[v] = parent[parent[v]]
+    return parent
+
+
 def find_contacts(
     head: DeformingMesh,
     hands: list[DeformingMesh],
@@ -162,8 +178,8 @@ def find_contacts(
 ) -> Contacts:
     """Contacts of all hands with the head, both ways: vertices of either against the faces of the other.
 
-    The normal is the direction of the shortest way apart. Where that way would pull the skin outwards (a fingertip that came
-    out on the far side, a vertex behind the finger) it is the head's smoothed outward normal instead.
+    The normal is the direction of the shortest way apart. Where that way would pull the skin outwards (a fingertip
+    that came out on the far side, a vertex behind the finger) it is the head's smoothed outward normal instead.
 
     Args:
         head: deformed head; `hands`: one mesh each, `hand_counts` their vertex numbers.

@@ -32,7 +32,7 @@ class ContactNumbers:
     stretch: float = 30.0  # of an edge [N/m]
     shear: float = 300.0  # of the layer of fat, by which neighbours move along [N/m]
     bending: float = 1e-5  # flexural rigidity of the skin [N m]
-    volume: float = 5e8  # resistance to loss of volume [N/m^5]
+    volume: float = 3e8  # resistance to loss of volume [N/m^5]
     friction: float = 0.3
     density: float = 10.0  # of moving tissue, per area [kg/m^2]
     reach: float = 0.05  # how far from a contact the skin moves, along the surface [m]
@@ -57,7 +57,8 @@ class FrameResult(NamedTuple):
     Attributes:
         head: deformed head [m], (V, 3) float64; `hands`: corrected hands.
         pose: correction of each hand, translation [m] and rotation vector [rad] about the hand's centroid, (H, 6).
-        head_contact: head vertices nearer to a hand than the touch distance, (V,) bool; `hand_contact` likewise.
+        head_contact: head vertices nearer to a hand than the touch distance, or corners of a face that is, (V,) bool;
+            `hand_contact` likewise.
         depth: greatest depth before and after [m]. steps: steps taken.
         exceeded: the depth left is over the tolerance, or a bound (dent, hand correction) was reached.
         active: number of simulated head vertices; 0 where nothing was to be done and the input is returned as it was.
@@ -113,14 +114,20 @@ class ContactSolver:
         hold = np.maximum([numbers.hand_stiffness, numbers.hand_turn_stiffness], 1e-3) * numbers.time_step**2
         self._pose_inverse_mass = np.tile(1.0 / hold, (len(hands), 1))
 
-    def solve(self, head: np.ndarray, hands: list[np.ndarray], before: FrameResult | None = None,
-              head_before: np.ndarray | None = None, hands_before: list[np.ndarray] | None = None) -> FrameResult:  # fmt: skip
+    def solve(
+        self,
+        head: np.ndarray,
+        hands: list[np.ndarray],
+        before: FrameResult | None = None,
+        head_before: np.ndarray | None = None,
+        hands_before: list[np.ndarray] | None = None,
+    ) -> FrameResult:
         """Resolves the contact of one frame.
 
         Args:
             head: head without contact [m], (V, 3). hands: tracked hands, (Vh, 3) each. All finite.
-            before: result of the preceding frame, if it belongs to the same uncut run; `head_before`, `hands_before` are
-                its inputs.
+            before: result of the preceding frame, if it belongs to the same uncut run; `head_before`, `hands_before`
+                are its inputs.
         """
         n = self.numbers
         head = np.ascontiguousarray(head, np.float64)
@@ -179,6 +186,8 @@ class ContactSolver:
             hand_contact.append(overlap.hand_distance < n.touch)
         if deepest > n.tolerance:
             return deepest, None
+        if head_contact.any() or any(touching.any() for touching in hand_contact):
+            self._label(head, hands, self._outward(head), head_contact, hand_contact)
         pose = np.zeros((len(hands), 6))
         return deepest, FrameResult(head, hands, pose, head_contact, hand_contact, (deepest, deepest), 0, False, 0)
 
@@ -240,6 +249,16 @@ class ContactSolver:
     def _edges_with(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         return self.surface.edges, self._hand_edges[k]
 
+    def _label(
+        self, x: np.ndarray, hands: list[np.ndarray], outward: np.ndarray, head: np.ndarray, hand: list[np.ndarray]
+    ) -> None:
+        """Adds, in place, the corners of the faces that something touches: a coarse mesh has no vertex near enough."""
+        contacts = self._contacts(x, hands, outward, np.zeros(0, np.int64), near=self.numbers.touch)
+        head[contacts.ids[contacts.weights > 0.2]] = True
+        for k, touching in enumerate(hand):
+            mine = contacts.hand == k
+            touching[contacts.anchor[mine][contacts.anchor_weights[mine] > 0.2]] = True
+
     def _active(self, touched: np.ndarray, old: np.ndarray) -> np.ndarray:
         """Vertices within reach of what is touched, along the surface, and those that were dented before."""
         distance = scipy.sparse.csgraph.dijkstra(
@@ -265,9 +284,11 @@ class ContactSolver:
         active, inverse_mass, pairs, lengths, faces, bulge = local
         table = np.concatenate((contacts.points, previous, contacts.normals), axis=1)
         relax(
-            x, head, inverse_mass, active, self._support, pairs, lengths, n.stretch, n.shear, s.ring, s.ring_ids, s.ring_weights,
+            x, head, inverse_mass, active, self._support, pairs, lengths, n.stretch, n.shear, s.ring, s.ring_ids,
+            s.ring_weights,
             self._bend, faces, bulge, n.volume, table, contacts.ids, contacts.weights, contacts.hand, pose,
-            np.zeros_like(pose[:, :2]) if held else self._pose_inverse_mass, np.array([n.hand_stiffness, n.hand_turn_stiffness]),
+            np.zeros_like(pose[:, :2]) if held else self._pose_inverse_mass,
+            np.array([n.hand_stiffness, n.hand_turn_stiffness]),
             np.array([n.hand_shift, n.hand_turn]), centre, n.time_step, iterations, n.friction, n.max_dent,
         )  # fmt: skip
 
@@ -283,22 +304,23 @@ class ContactSolver:
         moving = np.where(self._inverse_mass > 0, moving, 0.0)
         none, no_faces = np.zeros((0, 2), np.int64), np.zeros((0, 3), np.int64)
         held, still = np.zeros((len(hands), 6)), np.zeros((len(hands), 2))
-        for _ in range(n.repair):
+        for turn in range(n.repair):
             contacts = self._contacts(x, hands, outward, active, near=2e-4)
             if contacts.depth.max(initial=0.0) <= 0.5 * n.tolerance:
                 break
             table = np.concatenate((contacts.points, contacts.points, contacts.normals), axis=1)
-            # Aim a little outside, so that rounding and neighbours do not undo it.
-            table[:, :3] -= 0.2 * n.tolerance * contacts.normals
+            # Aim a little outside, so that rounding and neighbours do not undo it, and farther when they keep doing so.
+            table[:, :3] -= 0.2 * n.tolerance * (1.0 + turn) * contacts.normals
             relax(
                 x, head, moving, active, np.zeros(self._count), none, np.zeros(0), 0.0, 0.0, s.ring, s.ring_ids,
                 s.ring_weights, np.zeros(self._count), no_faces, moving, 0.0, table, contacts.ids, contacts.weights,
-                contacts.hand, held, still, np.zeros(2), np.full(2, np.inf), np.zeros((len(hands), 3)), 1.0, 4, 0.0,
+                contacts.hand, held, still, np.zeros(2), np.full(2, np.inf), np.zeros((len(hands), 3)), 1.0, 8, 0.0,
                 n.max_dent,
             )  # fmt: skip
 
     def _result(
-        self, x: np.ndarray, head: np.ndarray, hands: list[np.ndarray], pose: np.ndarray, depth: float, steps: int, active: int
+        self, x: np.ndarray, head: np.ndarray, hands: list[np.ndarray], pose: np.ndarray, depth: float, steps: int,
+        active: int,
     ) -> FrameResult:  # fmt: skip
         n = self.numbers
         self._head.move(x)
@@ -309,6 +331,7 @@ class ContactSolver:
             deepest = max(deepest, overlap.deepest)
             head_contact |= overlap.head_distance < n.touch
             hand_contact.append(overlap.hand_distance < n.touch)
+        self._label(x, hands, self._outward(head), head_contact, hand_contact)
         dent = float(np.linalg.norm(x - head, axis=1).max())
         shift = np.linalg.norm(pose[:, :3], axis=1).max()
         turn = np.linalg.norm(pose[:, 3:], axis=1).max()

@@ -41,7 +41,7 @@ class SequenceSolver:
     """Runs a `ContactSolver` over frames in order; keeps what the next frame starts from."""
 
     def __init__(self, solver: ContactSolver, runs: Sequence[tuple[int, int]]) -> None:
-        """Takes a solver and the uncut runs, (first, last) frame each, inclusive: nothing is carried from one to another."""
+        """Takes a solver and the uncut runs, (first, last) frame each, inclusive; nothing crosses their ends."""
         self._solver = solver
         self._starts = {first for first, _ in runs}
         self._before: tuple[FrameResult, np.ndarray, list[np.ndarray]] | None = None

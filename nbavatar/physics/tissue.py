@@ -1,9 +1,10 @@
 """What the head is made of: stiffness of the soft tissue over the skull, and the surface operators of the solver.
 
 Nobody has published the stiffness of the heads in question, so unless the user has data a stated heuristic is used:
-tissue is a layer on a skull, softer the thicker it is. The skull is a proxy of two ellipsoids in the rest shape's own axes
-(y up, z out of the face, as head models are): a cranium fitted to the skin above the eyes, and jaws inside the lower face.
-It is an anatomical guess, made to be looked at (last row of the picture of `nbavatar deform --validate`) and replaced.
+tissue is a layer on a skull, softer the thicker it is. The skull is a proxy of two ellipsoids in the rest shape's own
+axes (y up, z out of the face, as head models are): a cranium fitted to the skin above the eyes, and jaws inside the
+lower face. It is an anatomical guess, made to be looked at (last row of the picture of `nbavatar deform --validate`)
+and replaced.
 """
 
 import dataclasses
@@ -54,7 +55,7 @@ def soft_surface(rest: np.ndarray, faces: np.ndarray, bed: np.ndarray) -> SoftSu
     rows = stiffness.tocoo()
     off = (rows.row != rows.col) & (rows.data < 0)
     order = np.lexsort((rows.col[off], rows.row[off]))
-    row, column, weight = (a[off][order] for a in (rows.row, rows.col, -rows.data))
+    row, column, weight = (np.asarray(a)[off][order] for a in (rows.row, rows.col, np.negative(rows.data)))
     ring = np.zeros(len(rest) + 1, np.int64)
     np.add.at(ring, used[row] + 1, 1)
     area = np.full(len(rest), floor)
@@ -73,8 +74,8 @@ def soft_surface(rest: np.ndarray, faces: np.ndarray, bed: np.ndarray) -> SoftSu
 def bed_stiffness(thickness: np.ndarray, modulus: float, reference: float = 0.01) -> np.ndarray:
     """Stiffness per area of a layer of tissue on bone [N/m^3].
 
-    modulus / thickness * (1 + (reference / thickness)^2): a thick layer yields like a column of its own depth, a thin one
-    stiffens because incompressible tissue between skin and bone cannot get out of the way.
+    modulus / thickness * (1 + (reference / thickness)^2): a thick layer yields like a column of its own depth, a thin
+    one stiffens because incompressible tissue between skin and bone cannot get out of the way.
 
     Args:
         thickness: (V,) [m], positive.

@@ -19,8 +19,8 @@ def compare_deformation(
         moved: direction is compared where both displacements are longer than this [m].
 
     Returns:
-        On the reference's contact vertices: `mean_mm`, `p95_mm`, `max_mm` of the difference, and `reference_mm`, the mean
-        length of the reference there (the error of doing nothing). On all vertices that either moves by `moved`:
+        On the reference's contact vertices: `mean_mm`, `p95_mm`, `max_mm` of the difference, and `reference_mm`, the
+        mean length of the reference there (the error of doing nothing). On all vertices that either moves by `moved`:
         `moved_mean_mm`, `moved_reference_mm`, and `cosine` of the directions. `contact_precision`, `contact_recall`,
         `contact_f1` of the labels. NaN where there is nothing to compare.
     """
@@ -58,8 +58,8 @@ def plausibility(
 ) -> dict[str, float]:
     """Penetration and touch of two parts over N frames.
 
-    Unlike the public script of DICE, nothing deep is dropped as a leak, and a vertex counts as colliding only when it is
-    inside (there, values set to 0 count too).
+    Unlike the public script of DICE, nothing deep is dropped as a leak, and a vertex counts as colliding only when it
+    is inside (there, values set to 0 count too).
 
     Args:
         head: hierarchy of the head, `hand` of one hand; moved by this function.

@@ -1,9 +1,9 @@
 """Compliant position-based dynamics: one step of a soft surface against moving points.
 
-XPBD (Macklin, Mueller and Chentanez 2016) on displacements from a rest shape. Every constraint C has an energy k/2 C^2; in
-a time step h its compliance is 1 / (k h^2), so that stiffness means the same at any step length and iteration count, and
-0 (off) and 1e12 (rigid) are ordinary values. Constraints are projected one after the other in a fixed order: deterministic.
-There is no velocity: skin is overdamped, and a step starts from rest.
+XPBD (Macklin, Mueller and Chentanez 2016) on displacements from a rest shape. Every constraint C has an energy k/2
+C^2; in a time step h its compliance is 1 / (k h^2), so that stiffness means the same at any step length and iteration
+count, and 0 (off) and 1e12 (rigid) are ordinary values. Constraints are projected one after the other in a fixed
+order: deterministic. There is no velocity: skin is overdamped, and a step starts from rest.
 """
 
 import math
@@ -38,8 +38,8 @@ def relax(
         ids: (C, 3) head vertices of the contact, `weights` (C, 3) their barycentric weights.
         hand: (C,) index of the hand.
         pose: (H, 6) correction of each hand: translation [m], rotation vector [rad] about `centre` (H, 3) [m].
-        pose_inverse_mass: (H, 2) [1/kg], [1/(kg m^2)]; `pose_stiffness` (2,) [N/m], [N m]; `pose_bound` (2,) [m], [rad].
-            The hand points given hold for the pose at entry.
+        pose_inverse_mass: (H, 2) [1/kg], [1/(kg m^2)]; `pose_stiffness` (2,) [N/m], [N m]; `pose_bound` (2,) [m],
+            [rad]. The hand points given hold for the pose at entry.
         dt: time step [s]. iterations: at least 1. friction: Coulomb coefficient. max_dent: limit of |x - rest| [m].
 
     Returns:
@@ -224,7 +224,8 @@ def _volume(x, rest, inverse_mass, active, faces, bulge, gradient, impulse, stif
 
 @numba.njit(cache=True)
 def _touch(
-    x, start, inverse_mass, contacts, ids, weights, hand, pose, entry, pose_inverse_mass, centre, friction, pressed, sheared
+    x, start, inverse_mass, contacts, ids, weights, hand, pose, entry, pose_inverse_mass, centre, friction, pressed,
+    sheared,
 ):  # fmt: skip
     """Non-penetration n . (p - q) >= 0 and Coulomb friction for every contact."""
     d = np.zeros(3)

@@ -34,7 +34,8 @@ def _depth(head: np.ndarray, hand: np.ndarray) -> float:
         closed = DeformingMesh(verts, faces)
         inside = igl.winding_number(closed.verts, closed.closed_faces, points) > 0.5
         if inside.any():
-            deepest = max(deepest, float(np.sqrt(igl.point_mesh_squared_distance(points[inside], verts, faces)[0].max())))
+            squared = igl.point_mesh_squared_distance(points[inside], verts, faces)[0]
+            deepest = max(deepest, float(np.sqrt(squared.max())))
     return deepest
 
 

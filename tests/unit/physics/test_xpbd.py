@@ -7,7 +7,8 @@ from nbavatar.physics.xpbd import relax
 
 
 def _call(x, rest, mass, *, edges=(), support=0.0, stretch=0.0, shear=0.0, bend=0.0, ring=None, contacts=None, dt=0.1,
-          iterations=200, friction=0.0, max_dent=np.inf, active=None, pose_mass=0.0, hold=0.0, bound=np.inf):  # fmt: skip
+          iterations=200, friction=0.0, max_dent=np.inf, active=None, pose_mass=0.0, hold=0.0,
+          bound=np.inf):  # fmt: skip
     n = len(x)
     edges = np.array(edges, np.int64).reshape(-1, 2)
     starts, ids, weights = ring or (np.zeros(n + 1, np.int64), np.zeros(0, np.int64), np.zeros(0))
