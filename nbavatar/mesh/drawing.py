@@ -2,8 +2,6 @@
 
 from collections.abc import Callable
 
-from collections.abc import Callable
-
 import numpy as np
 
 from nbavatar.mesh.zbuffer import rasterize_mesh
