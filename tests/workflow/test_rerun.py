@@ -24,7 +24,7 @@ def finished(project):
 
 def _raw_names():
     names = ["assets/generic_model.pkl", "assets/landmark_embedding.npy", "assets/mano_v1_2/models/MANO_RIGHT.pkl"]
-    for camera in ("122", "110", "084", "108"):
+    for camera in ("102", "110", "084", "108"):
         names += [f"train/{kind}/S2/{camera}.mp4" for kind in ("videos", "segmentations")]
         names += [f"train/{kind}/S2/{camera}.npy" for kind in ("head_keys", "right_hand_keys", "head_bbs", "right_hand_bbs")]
     return [
