@@ -6,8 +6,8 @@ import typing
 from typing import Any
 
 from nbavatar.config.core import json_schema, to_mapping
-from nbavatar.config.preprocess import CropConfig
 from nbavatar.config.evaluation import ProtocolConfig
+from nbavatar.config.preprocess import CropConfig
 from nbavatar.config.run import RunConfig, Stages, Variant
 from nbavatar.config.tables import Panel, TableLayout, TableRow
 
@@ -21,9 +21,9 @@ A run is one YAML file: `paper.yaml`, `smoke.yaml`, `capture.yaml`, or one of yo
 `snakemake --configfile FILE`. It lists only what differs from the defaults below. Unknown keys, wrong types and values
 out of range stop the run before the first job.
 
-Beside it stand sheets, tab-separated, in which every id is text: `subjects.tsv` (subject, training cameras, test camera) and
-`runs.tsv` (subject, variant, protocol: one line for each number to produce; subject `*` means all). `tables.yaml` lays the tables
-out, `reported.csv` holds what the paper printed.
+Beside it stand sheets, tab-separated, in which every id is text: `subjects.tsv` (subject, training cameras, test
+camera) and `runs.tsv` (subject, variant, protocol: one line for each number to produce; subject `*` means all).
+`tables.yaml` lays the tables out, `reported.csv` holds what the paper printed.
 
 Mind YAML: write exponents as `1.0e-3` (`1e-3` is text), and quote ids that look like numbers.
 """

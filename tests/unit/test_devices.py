@@ -2,6 +2,7 @@ import subprocess
 import sys
 
 import pytest
+
 from nbavatar import devices
 from nbavatar.errors import DeviceError
 

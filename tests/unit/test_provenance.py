@@ -3,8 +3,9 @@ import shutil
 import sys
 from pathlib import Path
 
-import nbavatar
 import pytest
+
+import nbavatar
 from nbavatar import provenance
 from nbavatar.cli import VERBS
 

@@ -36,7 +36,9 @@ class Project:
         stub.write_text(STUB)
         stub.chmod(0o755)
         self.environment = dict(os.environ)
-        self.environment["PATH"] = f"{folder / 'bin'}{os.pathsep}{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        self.environment["PATH"] = (
+            f"{folder / 'bin'}{os.pathsep}{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        )
         self.environment["PYTHONPATH"] = str(folder)
 
     def snakemake(self, *words: str, config: str = "config/smoke.yaml") -> subprocess.CompletedProcess[str]:

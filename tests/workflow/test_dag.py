@@ -111,8 +111,9 @@ def test_lint_is_clean(project):
 
 
 def test_planning_imports_nothing_heavy(project):
+    words = ["-X", "importtime", "-m", "snakemake", "-n", "--cores", "1", "--configfile", "config/smoke.yaml"]
     out = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", "snakemake", "-n", "--cores", "1", "--configfile", "config/smoke.yaml"],
+        [sys.executable, *words],
         cwd=project.folder, env=project.environment, capture_output=True, text=True,
     )  # fmt: skip
     assert out.returncode == 0

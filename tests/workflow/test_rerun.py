@@ -26,7 +26,9 @@ def _raw_names():
     names = ["assets/generic_model.pkl", "assets/landmark_embedding.npy", "assets/mano_v1_2/models/MANO_RIGHT.pkl"]
     for camera in ("102", "110", "084", "108"):
         names += [f"train/{kind}/S2/{camera}.mp4" for kind in ("videos", "segmentations")]
-        names += [f"train/{kind}/S2/{camera}.npy" for kind in ("head_keys", "right_hand_keys", "head_bbs", "right_hand_bbs")]
+        names += [
+            f"train/{kind}/S2/{camera}.npy" for kind in ("head_keys", "right_hand_keys", "head_bbs", "right_hand_bbs")
+        ]
     return [
         *names, "train/cameras/S2/cameras.pkl", "train/params/S2/params_smoothed.pkl", "train/cutIDs/S2.pkl",
         "train/deformations/S2/deforms.npy", "train/contacts/S2/contacts_head.npy", "train/contacts/S2/contacts_rh.npy",

@@ -1,8 +1,9 @@
-"""The smoke run as a user meets it: same command, same folder. Where `make smoke` has run, nothing is computed again."""
+"""The smoke run as a user meets it: same command, same folder. After `make smoke` nothing is computed again."""
 
 import csv
 import json
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -19,9 +20,15 @@ pytestmark = pytest.mark.slow
 
 
 def _snakemake(*words):
-    command = [sys.executable, "-m", "snakemake", "--workflow-profile", "profiles/ci", "--configfile", "config/smoke.yaml"]
-    import os
-
+    command = [
+        sys.executable,
+        "-m",
+        "snakemake",
+        "--workflow-profile",
+        "profiles/ci",
+        "--configfile",
+        "config/smoke.yaml",
+    ]
     environment = dict(os.environ)
     environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
     return subprocess.run([*command, *words], cwd=ROOT, env=environment, capture_output=True, text=True)

@@ -3,6 +3,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+
 from nbavatar.camera.pinhole import crop_intrinsics, project, scale_intrinsics
 
 K = np.array([[500.0, 0.3, 210.5], [0, 480.0, 160.25], [0, 0, 1]])
@@ -50,7 +51,8 @@ def test_crop_and_scale_move_projected_points_like_the_pixels(x0, y0, sx, sy):
 
 
 def test_scale_agrees_with_where_area_averaging_puts_a_block():
-    # A 2x2 block of pixels at columns 4..5, rows 6..7 has its centre at (5, 7); halved, it is pixel (2, 3), centre (2.5, 3.5).
+    # A 2x2 block of pixels at columns 4..5, rows 6..7 has its centre at (5, 7); halved, it is pixel (2, 3), whose
+    # centre is (2.5, 3.5).
     ray = np.linalg.inv(K) @ [5.0, 7.0, 1.0]
     pixels, _ = project(ray[None], scale_intrinsics(K, 0.5, 0.5), np.eye(4))
     np.testing.assert_allclose(pixels[0], [2.5, 3.5], atol=1e-12)

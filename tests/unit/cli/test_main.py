@@ -2,6 +2,7 @@ import subprocess
 import sys
 
 import pytest
+
 from nbavatar import cli
 from nbavatar.errors import DataError
 
@@ -49,7 +50,10 @@ def test_version():
     [
         (DataError("x.npz: expected a, found b"), "nbavatar doctor: error: x.npz: expected a, found b"),
         (OSError(28, "No space left on device", "out.zip"), "nbavatar doctor: error: out.zip: No space left on device"),
-        (ModuleNotFoundError("No module named 'igl'", name="igl"), "nbavatar doctor: error: package 'igl' is not installed"),
+        (
+            ModuleNotFoundError("No module named 'igl'", name="igl"),
+            "nbavatar doctor: error: package 'igl' is not installed",
+        ),
     ],
 )
 def test_errors_of_the_outside_end_in_one_line(monkeypatch, capsys, error, line):

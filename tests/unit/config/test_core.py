@@ -2,6 +2,7 @@ import dataclasses
 import json
 
 import pytest
+
 from nbavatar.config.core import from_mapping, json_schema, merge, option, to_mapping
 from nbavatar.errors import ConfigError
 

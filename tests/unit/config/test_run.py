@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+
 from nbavatar.config.reference import reference_page, run_schema
 from nbavatar.config.run import load_run, stage_options
 from nbavatar.config.sheets import read_rows, read_subjects

@@ -2,6 +2,7 @@ import json
 import math
 
 import pytest
+
 from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
 from nbavatar.errors import ConfigError
 

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from nbavatar.data.sequences import MeshSequence, Part, read_sequence, write_sequence
 from nbavatar.errors import DataError
 

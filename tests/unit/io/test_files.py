@@ -4,6 +4,7 @@ import zipfile
 
 import numpy as np
 import pytest
+
 from nbavatar.errors import DataError
 from nbavatar.io.arrays import read_arrays, write_arrays
 from nbavatar.io.atomic import atomic_write
@@ -119,7 +120,10 @@ def test_frame_pack_round_trips(tmp_path, rng):
 
 
 def test_frame_pack_with_a_missing_image_is_not_written(tmp_path):
-    with pytest.raises(ValueError, match="rgb/001"), FramePackWriter(tmp_path / "a.zip", _manifest(["000", "001"])) as w:
+    with (
+        pytest.raises(ValueError, match="rgb/001"),
+        FramePackWriter(tmp_path / "a.zip", _manifest(["000", "001"])) as w,
+    ):
         w.add("rgb", "000", np.zeros((3, 4, 3), np.uint8))
     assert os.listdir(tmp_path) == []
 

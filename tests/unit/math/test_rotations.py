@@ -5,8 +5,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from nbavatar.math import rotations as rot
 from scipy.spatial.transform import Rotation
+
+from nbavatar.math import rotations as rot
 
 VECTOR = st.lists(st.floats(-7, 7), min_size=3, max_size=3)
 
