@@ -206,6 +206,7 @@ def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance [px] to, and flat index of, the nearest true pixel of a bool image."""
     away = np.where(mask, np.uint8(0), np.uint8(1))
     distance, tag = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    tag = np.asarray(tag, dtype=np.int64)
     index = np.zeros(int(tag.max()) + 1, dtype=np.int64)
     index[tag[mask]] = np.flatnonzero(mask)
-    return distance, index[tag]
+    return np.asarray(distance), index[tag]

@@ -183,7 +183,7 @@ def _cropped(image: np.ndarray, box: tuple[float, float, float, float], backgrou
     margin = math.ceil(max(0.0, -box[0], -box[1], box[2] - width, box[3] - height))
     canvas = np.tile(np.round(background * 255).astype(np.uint8), (height + 2 * margin, width + 2 * margin, 1))
     canvas[margin : margin + height, margin : margin + width] = image
-    moved = tuple(value + margin for value in box)
+    moved = (box[0] + margin, box[1] + margin, box[2] + margin, box[3] + margin)
     side = min(height, width)
     return np.asarray(Image.fromarray(canvas).resize((side, side), Image.Resampling.BICUBIC, box=moved))
 

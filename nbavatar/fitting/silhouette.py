@@ -95,7 +95,7 @@ def signed_distance_map(mask: np.ndarray, pixel: float) -> np.ndarray:
     if mask.all() or not mask.any():
         return np.zeros(mask.shape, dtype=np.float32)
     # Distances count from pixel centres: the border is half a pixel from either side.
-    outside, inside = distance_transform_edt(~mask), distance_transform_edt(mask)
+    outside, inside = (np.asarray(distance_transform_edt(where)) for where in (~mask, mask))
     return (pixel * np.where(mask, 0.5 - inside, outside - 0.5)).astype(np.float32)
 
 

@@ -83,6 +83,7 @@ def spread_labels(label: np.ndarray) -> np.ndarray:
         return label
     away = np.where(label > 0, np.uint8(0), np.uint8(1))
     _, nearest = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    nearest = np.asarray(nearest, dtype=np.int64)
     table = np.zeros(int(nearest.max()) + 1, dtype=np.uint8)
     table[nearest[label > 0]] = label[label > 0]
     return table[nearest]

@@ -1,5 +1,6 @@
 """Public function of the rasterizer: argument checks, projection, choice of the backend."""
 
+import os
 from collections.abc import Callable
 
 import torch
@@ -77,6 +78,7 @@ def render_billboards(
     Raises:
         DataError: a shape, dtype, device, option or value is wrong; one line says which.
         DeviceError: the backend asked for does not fit the tensors' device.
+        DependencyError: tensors are on a GPU and the package numba-cuda is missing.
     """
     if features is None and isinstance(alpha, Tensor):
         features = alpha.new_zeros(*alpha.shape, 0)
@@ -113,9 +115,11 @@ def _backend(name: str, device: torch.device) -> _Blend:
         from nbavatar.raster.cpu import blend_cpu  # Numba is loaded only when it is needed
 
         return blend_cpu
-    if name != device.type:
-        raise DeviceError.of(_WHERE, "backend", expected=f"tensors on {name}", found=f"tensors on {device.type}")
-    return blend_reference
+    if name == "cuda" and (device.type == "cuda" or os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"):
+        from nbavatar.raster.cuda import blend_cuda  # a machine without CUDA never gets here
+
+        return blend_cuda
+    raise DeviceError.of(_WHERE, "backend", expected=f"tensors on {name}", found=f"tensors on {device.type}")
 
 
 def _check_tensors(

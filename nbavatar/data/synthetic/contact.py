@@ -44,15 +44,14 @@ def signed_distance(
     faces = np.ascontiguousarray(faces, np.int64)
     squared, face, nearest = igl.point_mesh_squared_distance(points, verts, faces)
     distance = np.sqrt(squared)
-    candidates = np.flatnonzero(
-        distance < _DEEPEST
-    )  # nothing is ever deeper: the winding number is not needed further off
+    # Nothing is ever deeper: the winding number is not needed further off.
+    candidates = np.flatnonzero(distance < _DEEPEST)
     if len(candidates):
         fan, hub = rim_fan(faces, len(verts))
         closed = np.concatenate([verts, *(verts[ring].mean(0, keepdims=True) for ring in hub)])
-        winding = igl.winding_number(closed, np.concatenate([faces, fan]), points[candidates])
+        winding = np.asarray(igl.winding_number(closed, np.concatenate([faces, fan]), points[candidates]))
         distance[candidates[winding > 0.5]] *= -1
-    return distance, face, nearest
+    return distance, np.asarray(face), np.asarray(nearest)
 
 
 def rim_fan(faces: np.ndarray, count: int) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -186,7 +185,7 @@ def dent(
         inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
     target = np.zeros_like(head)
     held = np.zeros(len(head), bool)
-    region: np.ndarray | None = None
+    region = np.zeros(len(head), dtype=bool)
     residual = 0.0
     for step in range(rounds):
         verts = head + offset
@@ -221,7 +220,7 @@ def dent(
         moved = push > 0
         target[moved] = offset[moved] + push[moved, None] * inward[moved]
         held |= moved
-        if region is None or not region[held].all():
+        if not region[held].all():
             centre = head[held].mean(0)
             radius = np.linalg.norm(head[held] - centre, axis=1).max() + 0.07
             region = surface.movable & (np.linalg.norm(head - centre, axis=1) < radius)
