@@ -1,6 +1,8 @@
 """Sheets, checks, and the functions that rules share. Nothing here computes, and nothing imports torch."""
 
 import json
+import shutil
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,6 +35,10 @@ except NBAvatarError as error:
     raise WorkflowError(str(error)) from None
 
 R = f"results/{RUN.run}"
+
+# `.venv/bin/snakemake` works without activating the environment: its commands are then found beside it.
+if shutil.which("nbavatar") is None:
+    shell.prefix(f'export PATH="{Path(sys.executable).parent}:$PATH"; ')
 
 
 wildcard_constraints:
