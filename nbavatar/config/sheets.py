@@ -8,7 +8,7 @@ import dataclasses
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from nbavatar.errors import ConfigError, did_you_mean
@@ -72,8 +72,8 @@ def capture_subjects(root: str, test_camera: str) -> dict[str, Subject]:
 
     Args:
         root: folder of one capture, or of several.
-        test_camera: camera to hold out; empty for the most central one, whose centre is nearest to the mean of
-            all centres, so that the judged view lies between the training views.
+        test_camera: camera to hold out; empty for the one whose two nearest neighbours are nearest (by the farther of
+            the two), so that the judged view lies between training views.
     """
     import json
 
@@ -96,8 +96,7 @@ def capture_subjects(root: str, test_camera: str) -> dict[str, Subject]:
             raise ConfigError.of(path, expected="camera name -> width, height, K, R, t", found=repr(error)) from error
         if len(centres) < 2:
             raise ConfigError.of(path, expected="two cameras or more", found=len(centres))
-        mean = [sum(axis) / len(centres) for axis in zip(*centres.values(), strict=True)]
-        held_out = test_camera or min(sorted(centres), key=lambda name: math.dist(centres[name], mean))
+        held_out = test_camera or _best_surrounded(centres)
         if held_out not in centres:
             raise ConfigError(f"test_camera: unknown camera '{held_out}'; {did_you_mean(held_out, centres)}")
         train = tuple(sorted(set(centres) - {held_out}))
@@ -141,6 +140,13 @@ def _read(path: str | os.PathLike[str], columns: Sequence[str]) -> list[tuple[in
             raise ConfigError.of(f"{path}, line {number}", expected=f"{len(columns)} columns", found="another number")
         result.append((number, {key: value.strip() for key, value in row.items()}))
     return result
+
+
+def _best_surrounded(centres: Mapping[str, Sequence[float]]) -> str:
+    def second_nearest(name: str) -> float:
+        return sorted(math.dist(centres[name], other) for other in centres.values())[:3][-1]
+
+    return min(sorted(centres), key=second_nearest)
 
 
 def _centre(rotation: Sequence[Sequence[float]], translation: Sequence[float]) -> list[float]:

@@ -55,12 +55,12 @@ def _capture(folder, angles):
     (folder / "cameras.json").write_text(json.dumps(cameras))
 
 
-def test_capture_holds_out_the_most_central_camera_unless_told(tmp_path):
-    _capture(tmp_path / "demo", {"a": -0.6, "b": 0.1, "c": 0.5, "d": 0.0})
+def test_capture_holds_out_the_best_surrounded_camera_unless_told(tmp_path):
+    _capture(tmp_path / "demo", {"a": -0.6, "b": 0.12, "c": 0.5, "d": 0.0, "e": -0.15})
     assert capture_subjects(str(tmp_path / "demo"), "")["demo"].test_camera == "d"
     chosen = capture_subjects(str(tmp_path / "demo"), "a")["demo"]
     assert chosen.test_camera == "a"
-    assert chosen.train_cameras == ("b", "c", "d")
+    assert chosen.train_cameras == ("b", "c", "d", "e")
     with pytest.raises(ConfigError, match="unknown camera 'z'"):
         capture_subjects(str(tmp_path / "demo"), "z")
 
