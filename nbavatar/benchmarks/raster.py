@@ -9,6 +9,9 @@ programs on the machine disturb less; `samples` are the billboard hits blended i
 where rounding flips a decision (skip, stop, which hit is nearer); `peak_mb` is what rendering forward and
 backward added to the process's largest memory; `compile_s` the time until the kernels were ready;
 `order_differs` the share of pixels on which the other orders differ from `ray` by more than 1/255.
+On a GPU `forward_ms` is the whole public function, projection included, and `blend_ms`,
+`blend_backward_ms` are the device's own time in the kernels of the blending alone (binning included),
+by its event clock; `samples` are still counted by the CPU's kernels.
 """
 
 import argparse
@@ -67,7 +70,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         size=args.size, billboards=count, channels=args.channels, texels=args.texels, state=args.state
     ).to(args.device)
     start = time.perf_counter()
-    tiny = make_scene(size=8, billboards=1, channels=1, texels=1).to(args.device)
+    # GPU kernels are compiled for a number of channels, the others for all
+    channels = args.channels if args.device == "cuda" else 1
+    tiny = make_scene(size=8, billboards=1, channels=channels, texels=1).to(args.device)
     _render(tiny, args.order)
     figures: dict[str, Any] = {"compile_s": time.perf_counter() - start}
     figures |= measure(scene, args.order, args.repeats)
@@ -135,12 +140,58 @@ def measure(scene: RasterScene, order: str, repeats: int) -> dict[str, Any]:
         lambda: torch.autograd.grad(outputs, leaves, grads, retain_graph=True), max(3, repeats // 2), device
     )
     peak = torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else _peak_mb() - before
+    device_times = _blend_times(scene, order, repeats) if device == "cuda" else {}
     samples = _samples(scene, order)
     return {
         "forward_ms": forward, "backward_ms": backward, "forward_cpu_ms": forward_cpu,
         "backward_cpu_ms": backward_cpu, "fps": 1e3 / forward, "samples": samples,
-        "msamples_per_s": samples / forward / 1e3, "peak_mb": peak,
+        "msamples_per_s": samples / forward / 1e3, "peak_mb": peak, **device_times,
     }  # fmt: skip
+
+
+def _blend_times(scene: RasterScene, order: str, repeats: int) -> dict[str, float]:
+    """Medians, by the device's clock, of blending a projected scene; CUDA graphs where they can be had.
+
+    Replayed from a graph, the kernels follow each other without waiting for the host.
+    """
+    from nbavatar.raster.cuda import blend_cuda
+
+    projection, rank = _prepared(scene)
+    textures = [tensor.detach().clone().requires_grad_() for tensor in (scene.features, scene.alpha)]
+    settings = _blend_settings(scene, order)
+
+    def forward() -> Any:
+        with torch.no_grad():
+            return blend_cuda(projection, rank, *textures, settings)
+
+    def both() -> Any:
+        outputs = blend_cuda(projection, rank, *textures, settings)
+        return torch.autograd.grad(outputs, textures, [torch.ones_like(output) for output in outputs])
+
+    times = [_graph_ms(action, max(5, repeats)) for action in (forward, both)]
+    return {"blend_ms": times[0], "blend_backward_ms": times[1] - times[0]}
+
+
+def _graph_ms(action: Callable[[], Any], repeats: int) -> float:
+    """Median device time of an action's CUDA graph [ms]."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            action()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        action()
+    times = []
+    for _ in range(repeats + 1):
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        graph.replay()
+        end.record()
+        end.synchronize()
+        times.append(start.elapsed_time(end))
+    return statistics.median(times[1:])
 
 
 def _blend_settings(scene: RasterScene, order: str) -> BlendSettings:
