@@ -1,9 +1,17 @@
 """The re-run contract: which edit re-runs what. Commands are stubs; only plans are compared."""
 
 import re
+from pathlib import Path
 
 import pytest
 import yaml
+
+from nbavatar.config.sheets import read_subjects
+
+ROOT = Path(__file__).parents[2]
+
+# Some sixty stub jobs and twenty plans.
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -23,16 +31,14 @@ def finished(project):
 
 
 def _raw_names():
+    kinds = ("head_keys", "right_hand_keys", "head_bbs", "right_hand_bbs")
     names = ["assets/generic_model.pkl", "assets/landmark_embedding.npy", "assets/mano_v1_2/models/MANO_RIGHT.pkl"]
-    for camera in ("102", "110", "084", "108"):
+    for camera in read_subjects(ROOT / "config/smoke/subjects.tsv", "")["S2"].cameras:
         names += [f"train/{kind}/S2/{camera}.mp4" for kind in ("videos", "segmentations")]
-        names += [
-            f"train/{kind}/S2/{camera}.npy" for kind in ("head_keys", "right_hand_keys", "head_bbs", "right_hand_bbs")
-        ]
-    return [
-        *names, "train/cameras/S2/cameras.pkl", "train/params/S2/params_smoothed.pkl", "train/cutIDs/S2.pkl",
-        "train/deformations/S2/deforms.npy", "train/contacts/S2/contacts_head.npy", "train/contacts/S2/contacts_rh.npy",
-    ]  # fmt: skip
+        names += [f"train/{kind}/S2/{camera}.npy" for kind in kinds]
+    single = ("cameras/S2/cameras.pkl", "params/S2/params_smoothed.pkl", "cutIDs/S2.pkl", "deformations/S2/deforms.npy")
+    contacts = ("contacts/S2/contacts_head.npy", "contacts/S2/contacts_rh.npy")
+    return [*names, *(f"train/{name}" for name in (*single, *contacts))]
 
 
 @pytest.fixture
