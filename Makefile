@@ -41,11 +41,14 @@ paper: install  ## every table of the paper; needs the Decaf dataset and the bod
 	$(BIN)/nbavatar check --layout decaf resources/DecafDataset
 	$(SNAKEMAKE) --configfile config/paper.yaml
 
+# One thread a worker: two tests side by side are faster than one after the other on two threads.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES) --dist loadfile
+
 test: install  ## all tests, as in CI
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 test-fast: install  ## the tests that take seconds
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
 
 bench: install  ## benchmarks of the kernels
 	$(BIN)/nbavatar bench raster
