@@ -19,6 +19,7 @@ from nbavatar.avatar.model import Anchor, Avatar
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.views import ViewStore, ViewStream
 from nbavatar.errors import NBAvatarError
+from nbavatar.training.adam import Adam
 from nbavatar.training.objective import step_loss
 from nbavatar.training.preview import contact_sheet
 from nbavatar.training.schedule import Plan, plan_at, total_steps
@@ -101,7 +102,7 @@ def train(
         NBAvatarError: too many non-finite steps in a row.
     """
     groups = parameter_groups(avatar, config)
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.999), fused=True)
+    optimizer = Adam(groups)
     vertices = {part: meshes[part].to(device) for part in avatar.parts}
     anchors = _Anchors(avatar, vertices)
     clock = _Clock(config)
@@ -142,7 +143,7 @@ def train(
             sample = stream.get(step, plan.shrink)
             anchor = anchors.get(sample.view.row, sample.view.frame)
             random = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
-            optimizer.zero_grad(set_to_none=True)
+            optimizer.zero_grad()
             total, terms, _ = step_loss(avatar, sample, anchor, neighbours, lpips, plan, config, random)
             good = bool(torch.isfinite(total))
             if good:
@@ -241,7 +242,7 @@ class _PreviewTimes:
         return bool(passed)
 
 
-def _set_rates(optimizer: torch.optim.Optimizer, plan: Plan) -> None:
+def _set_rates(optimizer: Adam, plan: Plan) -> None:
     for group in optimizer.param_groups:
         group["lr"] = group["base"] * plan.rate * (plan.position_rate if group["name"] == _POSITION else 1.0)
 
