@@ -13,6 +13,9 @@ which needs no division by a transmittance. It sums gradients by atomic addition
 not fixed: results differ from run to run by rounding.
 """
 
+# Inside a kernel, numba's own types apply; its stubs describe the host's side.
+# pyright: reportOptionalSubscript=false, reportArgumentType=false, reportOperatorIssue=false
+
 import math
 from functools import lru_cache
 from typing import Any

@@ -70,7 +70,9 @@ def crop_options(wildcards):
 def protocol_options(wildcards):
     from nbavatar.config.core import to_mapping
 
-    values = to_mapping(RUN.protocols[wildcards.protocol]) | {"name": wildcards.protocol}
+    values = to_mapping(RUN.protocols[wildcards.protocol]) | {
+        "name": wildcards.protocol
+    }
     return json.dumps(values, sort_keys=True)
 
 

@@ -18,9 +18,7 @@ if RUN.synthetic:
                         *(
                             path
                             for c in SUBJECTS[s].cameras
-                            for path in raw_files(
-                                SimpleNamespace(subject=s, camera=c)
-                            )
+                            for path in raw_files(SimpleNamespace(subject=s, camera=c))
                         ),
                     ]
                 )

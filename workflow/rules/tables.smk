@@ -46,13 +46,7 @@ rule report:
         evals=evals_of(ROWS),
         speeds=sorted({path for table in TABLES for path in speeds_of(table)}),
         renders=renders_of(ROWS),
-        frames=sorted(
-            {
-                path
-                for row in ROWS
-                for path in protocol_frames(row)
-            }
-        ),
+        frames=sorted({path for row in ROWS for path in protocol_frames(row)}),
         histories=[f"{R}/train/{s}/{v}/history.jsonl" for s, v in avatars()],
         pictures=report_pictures(),
     output:
