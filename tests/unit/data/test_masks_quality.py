@@ -60,4 +60,4 @@ def test_masks_of_lossy_distorted_videos_are_close_to_the_exact_ones(tmp_path):
             values.append(((label == part) & (truth == part)).sum() / ((label == part) | (truth == part)).sum())
     # Measured: worst frame 0.961 and 0.936; at 960 x 540 with full meshes the means are 0.989 and 0.981.
     assert np.mean(scores[1]) > 0.97 and np.mean(scores[2]) > 0.97
-    assert min(scores[1]) > 0.94 and min(scores[2]) > 0.92
+    assert min(scores[1]) > 0.94 and min(scores[2]) > 0.93
