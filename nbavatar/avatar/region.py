@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nbavatar.avatar.billboards import Posed
 
-__all__ = ["Region", "full_region", "paste", "region_of", "shift_camera"]
+__all__ = ["Region", "full_region", "paste", "region_of", "shift_camera", "visible_box"]
 
 
 class Region(NamedTuple):
@@ -55,10 +55,7 @@ def region_of(
     margin: float,
     near: float = 0.01,
 ) -> Region:
-    """Smallest aligned window around the visible billboards.
-
-    Each billboard counts as a sphere of its half diagonal, so the box is conservative; the part of the avatar outside
-    the image counts for nothing, and if a sphere crosses the near plane the whole image is returned.
+    """Smallest aligned window around the visible billboards (`visible_box`).
 
     Args:
         posed: billboards in world space.
@@ -67,16 +64,42 @@ def region_of(
         width, height: image size [px].
         multiple: alignment of both sides [px].
         margin: added on every side, as a share of the longer side of the box (what the mesh does not cover: hair).
+        near: near plane [m].
 
     Returns:
         Region; one tile in the middle of the image when no billboard is visible.
+    """
+    box = visible_box(posed, viewmat, K, width, height, near=near)
+    if box is None:
+        return Region((width - multiple) // 2, (height - multiple) // 2, multiple, multiple)
+    x0, y0, x1, y1 = box
+    extra = margin * max(x1 - x0, y1 - y0)
+    left, right = _align(x0 - extra, x1 + extra, width, multiple)
+    top, bottom = _align(y0 - extra, y1 + extra, height, multiple)
+    return Region(left, top, right - left, bottom - top)
+
+
+def visible_box(
+    posed: Posed, viewmat: Tensor, K: Tensor, width: int, height: int, *, near: float = 0.01
+) -> tuple[float, float, float, float] | None:
+    """Box x0, y0, x1, y1 [px] inside the image around the billboards that can be seen, or None where none can.
+
+    Each billboard counts as a sphere of its half diagonal, so the box is conservative; the part of the avatar outside
+    the image counts for nothing, and if a sphere crosses the near plane the box is the whole image.
+
+    Args:
+        posed: billboards in world space; there may be none.
+        viewmat: world to camera, (4, 4).
+        K: intrinsics [px], (3, 3).
+        width, height: image size [px].
+        near: near plane [m].
     """
     with torch.no_grad():
         camera = posed.means @ viewmat[:3, :3].T + viewmat[:3, 3]
         radius = posed.half_extents.norm(dim=1) * 1.2  # textures fade out a little beyond +-1
         depth = camera[:, 2]
         if bool(((depth + radius > near) & (depth - radius <= near)).any()):
-            return full_region(width, height, multiple)
+            return 0.0, 0.0, float(width), float(height)
         front = depth > near
         safe = torch.where(front, depth, torch.ones_like(depth))
         low, high = [], []
@@ -87,14 +110,10 @@ def region_of(
             high.append(torch.where(front, centre + reach, centre.new_full((), -float("inf"))))
             front = front & (high[-1] > 0) & (low[-1] < size)
         if not bool(front.any()):
-            return Region((width - multiple) // 2, (height - multiple) // 2, multiple, multiple)
+            return None
         box = torch.stack([low[0][front].amin(), low[1][front].amin(), high[0][front].amax(), high[1][front].amax()])
         x0, y0, x1, y1 = (float(v) for v in box)
-    x0, x1, y0, y1 = max(x0, 0.0), min(x1, width), max(y0, 0.0), min(y1, height)
-    extra = margin * max(x1 - x0, y1 - y0)
-    left, right = _align(x0 - extra, x1 + extra, width, multiple)
-    top, bottom = _align(y0 - extra, y1 + extra, height, multiple)
-    return Region(left, top, right - left, bottom - top)
+    return max(x0, 0.0), max(y0, 0.0), min(x1, float(width)), min(y1, float(height))
 
 
 def _align(low: float, high: float, size: int, multiple: int) -> tuple[int, int]:
