@@ -7,7 +7,7 @@ import numpy as np
 
 from nbavatar.mesh.bvh import DeformingMesh, surface_points
 
-__all__ = ["Contacts", "Overlap", "estimate_overlap", "find_contacts", "measure_overlap", "outside_free"]
+__all__ = ["Contacts", "Overlap", "estimate_overlap", "find_contacts", "measure_overlap"]
 
 # Steps by which the way out of a hand is searched along the inward normal [m].
 _MARCH = np.arange(1, 17) * 0.002
@@ -54,12 +54,6 @@ class Overlap(NamedTuple):
     def deepest(self) -> float:
         """Greatest depth of any vertex [m]."""
         return float(max(self.hand_depth.max(initial=0.0), self.head_depth.max(initial=0.0)))
-
-
-def outside_free(head: DeformingMesh, hand: DeformingMesh, distance: float) -> bool:
-    """True if the bounding boxes alone show that nothing is nearer than `distance` [m]."""
-    (a, b), (c, d) = head.box(), hand.box()
-    return bool((c > b + distance).any() or (d < a - distance).any())
 
 
 def measure_overlap(head: DeformingMesh, hand: DeformingMesh, count: tuple[int, int], radius: float) -> Overlap:

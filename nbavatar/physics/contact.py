@@ -18,7 +18,7 @@ import scipy.sparse.csgraph
 from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.mesh.drawing import vertex_normals
 from nbavatar.mesh.topology import edges
-from nbavatar.physics.collision import Contacts, estimate_overlap, find_contacts, measure_overlap, outside_free
+from nbavatar.physics.collision import Contacts, estimate_overlap, find_contacts, measure_overlap
 from nbavatar.physics.tissue import SoftSurface
 from nbavatar.physics.xpbd import relax
 
@@ -177,7 +177,7 @@ class ContactSolver:
         deepest, head_contact, hand_contact = 0.0, np.zeros(self._count, bool), []
         for k, (mesh, hand, count) in enumerate(zip(self._hands, hands, self._hand_counts, strict=True)):
             mesh.move(hand)
-            if outside_free(self._head, mesh, n.touch):
+            if self._head.clear_of(mesh, n.touch):
                 hand_contact.append(np.zeros(count, bool))
                 continue
             overlap = estimate_overlap(self._head, mesh, self._edges_with(k), (self._count, count), n.touch)
