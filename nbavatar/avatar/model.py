@@ -1,36 +1,31 @@
-"""The avatar as one object: meshes' faces, billboards, renderer, and one file that holds them all.
+"""The avatar as one object: meshes' faces, billboards and renderer.
 
     features, nb_alpha = rasterize(billboards posed on the mesh)          paper, eq. 1
     colour, alpha      = R(features, nb_alpha)                            U-Net
     I                  = colour alpha + (1 - alpha) background            paper, eq. 2
 
-`model.pt` opens with ``torch.load(..., weights_only=True)``: tensors, numbers and text, nothing executable.
 Without deferred rendering (ablation 'w/o DNR') the textures hold RGB behind a sigmoid and the billboards' own
 opacity is the picture's.
 """
 
 import dataclasses
-import json
-import os
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from nbavatar.avatar.base import MeshAvatar, Stages, compose
 from nbavatar.avatar.billboards import Billboards, Posed, anchor_quaternions
 from nbavatar.avatar.refine import Refinement
 from nbavatar.avatar.region import Region, full_region, paste, region_of, shift_camera
-from nbavatar.avatar.unet import UNet
-from nbavatar.errors import DataError
-from nbavatar.io.atomic import atomic_write
+from nbavatar.avatar.storage import load_avatar, save_avatar
+from nbavatar.avatar.unet import UNet, macs
 from nbavatar.mesh.frames import FaceFrames, face_frames
 from nbavatar.raster.functional import render_billboards
 
 __all__ = ["Anchor", "Architecture", "Avatar", "Window", "compose", "load_avatar", "save_avatar"]
 
-FORMAT = 1
-_KIND = "nbavatar avatar"
 _DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
@@ -84,25 +79,16 @@ class Window(NamedTuple):
     region: Region
 
 
-def compose(colour: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
-    """I = I_R I_alpha + (1 - I_alpha) C_bg (paper, eq. 2); (3, H, W), (H, W), (3,) or (3, H, W)."""
-    behind = background[:, None, None] if background.ndim == 1 else background
-    return colour * alpha + (1.0 - alpha) * behind
-
-
-class Avatar(nn.Module):
+class Avatar(MeshAvatar):
     """Neural billboards on the faces of the parts, and the renderer.
 
     Attributes:
-        parts: names of the parts in order; vertices and faces are concatenated in this order.
-        vertex_counts, face_counts: vertices and faces of each part.
         billboards: one per face.
         unet: renderer R, or None without deferred rendering.
         refinement: compensation of fitting errors on training frames, or None.
-        record: provenance.
     """
 
-    faces: Tensor
+    method: ClassVar[str] = "billboards"
 
     def __init__(
         self,
@@ -114,16 +100,8 @@ class Avatar(nn.Module):
         refinement: Refinement | None = None,
         record: Mapping[str, Any] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(faces, vertex_counts, record)
         self.architecture = architecture
-        self.parts = list(faces)
-        self.vertex_counts = {part: int(vertex_counts[part]) for part in self.parts}
-        self.face_counts = {part: len(faces[part]) for part in self.parts}
-        merged, first = [], 0
-        for part in self.parts:
-            merged.append(faces[part].to(torch.int64) + first)
-            first += self.vertex_counts[part]
-        self.register_buffer("faces", torch.cat(merged))
         self.billboards = billboards
         a = architecture
         self.unet = (
@@ -134,17 +112,21 @@ class Avatar(nn.Module):
             else None
         )
         self.refinement = refinement
-        self.record = dict(record or {})
+
+    @property
+    def primitives(self) -> int:
+        """Number of billboards."""
+        return len(self.billboards.mu)
+
+    @property
+    def fixed_anchors(self) -> bool:
+        """Anchors stay as they are unless a refinement moves the meshes."""
+        return self.refinement is None
 
     @property
     def multiple(self) -> int:
         """Alignment of rendered windows [px]."""
         return 2**self.architecture.unet_depth if self.unet is not None else 1
-
-    def face_groups(self) -> Tensor:
-        """Part index of every face, int64 [F]."""
-        counts = torch.tensor([self.face_counts[part] for part in self.parts])
-        return torch.repeat_interleave(torch.arange(len(self.parts)), counts)
 
     def anchor(self, verts: Mapping[str, Tensor], frame: str | None = None) -> Anchor:
         """Face frames of one frame's meshes.
@@ -156,26 +138,18 @@ class Avatar(nn.Module):
         Raises:
             DataError: a part has another number of vertices.
         """
-        present, shown = [], []
         penalty = self.billboards.mu.new_zeros(())
-        for part in self.parts:
-            points = verts.get(part)
-            if points is not None and points.shape != (self.vertex_counts[part], 3):
-                raise DataError.of(
-                    "meshes", part, expected=f"{self.vertex_counts[part]} vertices", found=f"{list(points.shape)}"
-                )
-            there = points is not None and bool(torch.isfinite(points).all())
-            if points is None or not there:
-                points = self.faces.new_zeros((self.vertex_counts[part], 3), dtype=self.billboards.mu.dtype)
-            elif self.refinement is not None and frame is not None:
-                points, extra = self.refinement(part, points, frame)
-                penalty = penalty + extra
-            present.append(points)
-            shown.append(there)
-        frames = face_frames(torch.cat(present), self.faces)
-        keep = None
-        if not all(shown):
-            keep = torch.tensor(shown)[self.face_groups()].nonzero().squeeze(1).to(self.faces.device)
+
+        def refined(part: str, points: Tensor) -> Tensor:
+            nonlocal penalty
+            if self.refinement is None or frame is None:
+                return points
+            points, extra = self.refinement(part, points, frame)
+            penalty = penalty + extra
+            return points
+
+        points, keep = self.merged(verts, refined)
+        frames = face_frames(points, self.faces)
         return Anchor(frames, anchor_quaternions(frames), keep, penalty)
 
     def place(self, anchor: Anchor) -> tuple[Posed, Tensor | None]:
@@ -269,73 +243,99 @@ class Avatar(nn.Module):
         colour = paste(window.colour, window.region, width, height)
         return compose(colour, alpha, background), alpha, nb_alpha
 
+    def panels(
+        self,
+        verts: Mapping[str, Tensor],
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        background: Tensor,
+        frame: str | None = None,
+    ) -> list[Tensor]:
+        """Render, opacity of the billboards, and their first three features in false colours."""
+        posed, keep = self.pose(verts, frame)
+        window = self.window(posed, keep, viewmat, K, width, height)
+        place = window.region, width, height
+        image = compose(paste(window.colour, *place), paste(window.alpha, *place), background)
+        nb_alpha = paste(window.nb_alpha, *place).expand(3, -1, -1)
+        # Shifted so that zero is grey; fewer channels are repeated.
+        shown = window.features[[min(i, len(window.features) - 1) for i in range(3)]]
+        return [image, nb_alpha, paste(0.5 + 0.5 * torch.tanh(shown), *place, 0.5)]
 
-def save_avatar(path: str | os.PathLike[str], avatar: Avatar) -> None:
-    """Write an avatar to one file, atomically."""
-    first = 0
-    faces = {}
-    offset = 0
-    for part in avatar.parts:
-        last = first + avatar.face_counts[part]
-        faces[part] = (avatar.faces[first:last] - offset).cpu()
-        first, offset = last, offset + avatar.vertex_counts[part]
-    content = {
-        "kind": _KIND,
-        "format": FORMAT,
-        "architecture": dataclasses.asdict(avatar.architecture),
-        "faces": faces,
-        "vertex_counts": avatar.vertex_counts,
-        "refinement": None
-        if avatar.refinement is None
-        else {"frames": avatar.refinement.frames, "rigid": avatar.refinement.rigid},
-        "record": json.dumps(avatar.record, sort_keys=True),
-        # Detached clones: a view would drag its whole storage into the file.
-        "state": {name: value.detach().cpu().clone() for name, value in avatar.state_dict().items() if name != "faces"},
-    }
-    with atomic_write(path) as temporary:
-        torch.save(content, temporary)
+    def stages(
+        self,
+        verts: Mapping[str, Tensor],
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        background: Tensor,
+        precisions: Sequence[str],
+    ) -> Stages:
+        """Stages of the paper's timing table: pose, raster (neural textures, RGB), renderer, compose, total."""
+        with torch.no_grad():
+            posed, keep = self.pose(verts)
+            features, alpha = self.textures()
+            if keep is not None:
+                features, alpha = features[keep], alpha[keep]
+            window = self.window(posed, keep, viewmat, K, width, height)
+            rgb = features[..., [min(i, features.shape[-1] - 1) for i in range(3)]].contiguous()
+        region = window.region
 
+        def raster(values: Tensor) -> Callable[[], Any]:
+            return lambda: render_billboards(
+                *posed, values, alpha, viewmat, shift_camera(K, region), region.width, region.height,
+                order=self.architecture.order,
+            )  # fmt: skip
 
-def load_avatar(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> Avatar:
-    """Read an avatar.
+        calls: dict[str, Callable[[], Any]] = {
+            "pose": lambda: self.pose(verts),
+            "raster": raster(features),
+            "raster_rgb": raster(rgb),
+            "compose": lambda: compose(window.colour, window.alpha, background),
+        }
+        for precision in precisions if self.unet is not None else ["fp32"]:
+            if self.unet is not None:
+                calls[f"renderer_{precision}"] = lambda p=precision: self.decode(window.features, window.nb_alpha, p)
+            calls[f"total_{precision}"] = lambda p=precision: self.render(
+                verts, viewmat, K, width, height, background, precision=p
+            )[0]
+        return Stages(calls, region.width * region.height / (width * height))
 
-    Raises:
-        DataError: missing, damaged, not an avatar, or of another format version.
-    """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="an avatar (model.pt)", found="no such file") from error
-    except Exception as error:  # torch raises many kinds for damaged and for hostile files
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DataError.of(
-            path, expected="an avatar (model.pt)", found=f"a damaged or foreign file ({reason})"
-        ) from error
-    if not isinstance(content, dict) or content.get("kind") != _KIND:
-        raise DataError.of(path, "kind", expected=f"'{_KIND}'", found="something else")
-    if content["format"] != FORMAT:
-        raise DataError.of(
-            path, "format", expected=FORMAT, found=content["format"], fix="train it again with this version"
-        )
-    try:
-        state: dict[str, Tensor] = content["state"]
+    def facts(self, width: int, height: int) -> dict[str, Any]:
+        """Billboards, channels, texels, and multiply-adds of the renderer for a whole picture."""
+        return {
+            "billboards": self.primitives,
+            "channels": self.architecture.channels,
+            "texels": self.architecture.texels,
+            "renderer_gmac": None if self.unet is None else round(macs(self.unet, height, width) / 1e9, 3),
+        }
+
+    def content(self) -> dict[str, Any]:
+        """Architecture and refinement."""
+        refinement = self.refinement
+        return {
+            "architecture": dataclasses.asdict(self.architecture),
+            "refinement": None if refinement is None else {"frames": refinement.frames, "rigid": refinement.rigid},
+        }
+
+    @classmethod
+    def rebuild(cls, content: Mapping[str, Any], state: Mapping[str, Tensor], record: Mapping[str, Any]) -> "Avatar":
+        """An avatar of the stored shape, its values still to be loaded."""
         billboards = Billboards(
             torch.ones_like(state["billboards.log_scale"]),
             state["billboards.features"],
             state["billboards.alpha_logit"],
         )
-        avatar = Avatar(
+        return cls(
             Architecture(**content["architecture"]),
             content["faces"],
             content["vertex_counts"],
             billboards,
             refinement=_empty_refinement(content["refinement"], state),
-            record=json.loads(content["record"]),
+            record=record,
         )
-        avatar.load_state_dict({**state, "faces": avatar.faces})
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise DataError.of(path, expected="a whole avatar", found=f"contents that disagree ({error})") from error
-    return avatar.to(device).eval()
 
 
 def _empty_refinement(described: Mapping[str, Any] | None, state: Mapping[str, Tensor]) -> Refinement | None:

@@ -7,7 +7,7 @@ pixels
 --protocol  JSON text or file, for example {"name": "nv1024", "split": "novel_view"}: novel view = training
             frames in a held-out camera; self-reenactment = held-out frames in the training cameras
 --out       frame pack (.zip): frames "<camera>/<frame>", layers rgb (on the protocol's background), alpha (opacity of
-            the picture) and nb_alpha (opacity of the billboards), uint8
+            the picture) and nb_alpha (opacity of the billboards or Gaussians), uint8
 """
 
 import argparse
@@ -25,7 +25,7 @@ __all__ = ["add_arguments", "main"]
 _LAYERS = {
     "rgb": "colour on the protocol's background",
     "alpha": "opacity of the picture",
-    "nb_alpha": "opacity of the rasterized billboards",
+    "nb_alpha": "opacity of the rasterized primitives",
 }
 
 
@@ -49,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _render(args: argparse.Namespace, protocol: ProtocolConfig, device: str) -> int:
-    from nbavatar.avatar.model import load_avatar
+    from nbavatar.avatar.storage import load_avatar
     from nbavatar.data.sequences import read_sequence
     from nbavatar.data.views import views_of
     from nbavatar.evaluation.protocols import select_frames

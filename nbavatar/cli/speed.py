@@ -4,7 +4,8 @@
     --meshes   mesh sequence (.npz)
     --frames   frame packs (.zip): cameras and picture sizes; pixels are not read
     --out      JSON: median milliseconds per stage (pose, raster with neural textures and with RGB, U-Net per
-               arithmetic, compose, total), frames a second, picture size, peak memory, device, threads
+               arithmetic, compose, total; a baseline has fewer), frames a second, picture size, number of primitives,
+               size of the model, what its training took, peak memory, device, threads
 
 Run it alone on its device. Figures of small test subjects carry their picture size and number of billboards, and
 compare with nothing else.
@@ -37,8 +38,7 @@ def main(args: argparse.Namespace) -> int:
     """Runs `nbavatar speed`."""
     config = stage_config(args, SpeedConfig)
     with lease_device(args.device) as device:
-        from nbavatar.avatar.model import load_avatar
-        from nbavatar.avatar.unet import macs
+        from nbavatar.avatar.storage import load_avatar
         from nbavatar.data.sequences import read_sequence
         from nbavatar.data.views import views_of
         from nbavatar.evaluation.protocols import select_frames
@@ -53,12 +53,15 @@ def main(args: argparse.Namespace) -> int:
         views = views_of(packs, sequence.frames, chosen)[: config.frames]
         result = measure_speed(avatar, sequence, views, config, device=device)
         width, height = result["size"]
-        result["renderer_gmac"] = None if avatar.unet is None else round(macs(avatar.unet, height, width) / 1e9, 3)
         result["model_mb"] = round(os.path.getsize(args.model) / 1e6, 3)
+        trained = avatar.record.get("summary", {})
+        for name in ("model_bytes", "train_seconds", "steps"):
+            result[name] = trained.get(name)
+        result["train_peak_memory_mb"] = trained.get("peak_memory_mb")
         inputs = {"model": args.model, "meshes": args.meshes} | {f"frames.{i}": p for i, p in enumerate(args.frames)}
         record = run_record("speed", config=to_mapping(config), inputs=inputs, device=device_name(device))
     write_json(args.out, record | {"speed": result})
     totals = ", ".join(f"{name} {value:.1f} FPS" for name, value in result["fps"].items())
-    what = f"{width}x{height}, {result['billboards']} billboards, raster {result['ms']['raster']:.2f} ms"
+    what = f"{width}x{height}, {result['primitives']} primitives, raster {result['ms']['raster']:.2f} ms"
     print(f"{args.out}: {what}, {totals}")
     return 0

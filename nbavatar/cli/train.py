@@ -1,4 +1,4 @@
-"""Train an avatar: neural billboards on the meshes and the U-Net that decodes them.
+"""Train an avatar on meshes: neural billboards and the U-Net that decodes them, or a baseline (option `method`).
 
     --frames    frame packs (.zip) of the training cameras, as `nbavatar crop` writes them: layers rgb (uint8 [H, W,
                 3]), alpha and label (uint8 [H, W]), intrinsics [px] and world-to-camera transforms [m]; frames whose
@@ -23,7 +23,7 @@ from typing import Any
 from nbavatar.cli.common import add_cfg_argument, stage_config
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.config.core import to_mapping
-from nbavatar.devices import device_name, lease_device
+from nbavatar.devices import device_name, lease_device, peak_memory_mb
 from nbavatar.errors import DataError
 from nbavatar.io.arrays import read_arrays
 from nbavatar.io.atomic import atomic_write
@@ -78,37 +78,33 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     # torch is imported after the device has been leased.
     import torch
 
-    from nbavatar.avatar.model import save_avatar
+    from nbavatar.avatar.storage import save_avatar
     from nbavatar.data.sequences import read_sequence
     from nbavatar.data.views import ViewStore, views_of
     from nbavatar.io.framepack import FramePack
     from nbavatar.training.loop import train
-    from nbavatar.training.setup import initial_avatar, modelled_parts, neighbour_graph
+    from nbavatar.training.method import create_method
     from nbavatar.training.state import RunFolder
 
     sequence, _ = read_sequence(args.meshes)
     coords = _read_coords(args.spectral, list(sequence.parts))
     packs = [FramePack(path) for path in args.frames]
     views = views_of(packs, sequence.frames, [pack.split("train") for pack in packs], layers=("rgb", "alpha"))
-    used = sorted({view.row for view in views})
-    parts = modelled_parts(sequence, config)
-    avatar = initial_avatar(sequence, coords, [sequence.frames[row] for row in used], config).to(device)
-    neighbours = neighbour_graph(avatar, sequence, config)
-    lpips = None
-    if config.weight_lpips > 0:
+    method = create_method(sequence, coords, views, config, device)
+    avatar, net, lpips = method.avatar, method.lpips_net(), None
+    if net is not None:
         from nbavatar.metrics.lpips import load_lpips
 
-        lpips = load_lpips(config.lpips_net).to(device)
+        lpips = load_lpips(net).to(device)
     folder = RunFolder(f"{args.out}.state", {name: record[name] for name in ("config", "code", "inputs")})
     if folder.moved_to is not None:
         print(f"an earlier state belongs to other inputs, options or code; moved to {folder.moved_to}", file=sys.stderr)
     bar, stop = _Bar(Path(args.out).name), _TerminationFlag()
     summary = train(
-        avatar,
-        ViewStore(packs, views, parts, config.cache_mb * 1_000_000),
+        method,
+        ViewStore(packs, views, avatar.parts, config.cache_mb * 1_000_000),
         len(views),
-        {part: torch.from_numpy(sequence.parts[part].verts) for part in parts},
-        None if neighbours is None else neighbours.to(device),
+        {part: torch.from_numpy(sequence.parts[part].verts) for part in avatar.parts},
         lpips,
         config,
         folder,
@@ -118,6 +114,7 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     )
     bar.close()
     if summary["finished"]:
+        summary |= {"train_seconds": summary["seconds"], "peak_memory_mb": round(peak_memory_mb(device), 1)}
         avatar.record = {**record, "summary": summary, "threads": torch.get_num_threads()}
         if args.history:
             with atomic_write(args.history) as temporary:

@@ -8,6 +8,7 @@ __all__ = ["RatesConfig", "RefineConfig", "SpeedConfig", "TrainConfig", "UNetCon
 
 _PARTS = ("head", "right_hand", "left_hand")
 _PRECISIONS = ("fp32", "bf16", "fp16")
+_METHODS = ("billboards",)
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class RefineConfig:
 class TrainConfig:
     """Training of one avatar."""
 
+    method: str = option("billboards", "What is trained: the paper's billboards, or a baseline.", choices=_METHODS)
     parts: list[str] | None = option(None, "Parts to model; all that the meshes have by default.", choices=_PARTS)
     channels: int = option(6, "Feature channels C of the neural textures.", min=1, max=64)
     texels: int = option(16, "Texels a side T of every texture.", min=1, max=64)

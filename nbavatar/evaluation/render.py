@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.avatar.model import Avatar
+from nbavatar.avatar.base import MeshAvatar
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
@@ -25,28 +25,23 @@ class Picture(NamedTuple):
     nb_alpha: np.ndarray
 
 
-def check_parts(avatar: Avatar, sequence: MeshSequence) -> None:
+def check_parts(avatar: MeshAvatar, sequence: MeshSequence) -> None:
     """Assert that meshes fit an avatar.
 
     Raises:
         DataError: a part is missing or has another number of vertices or other faces.
     """
-    first, offset = 0, 0
-    for part in avatar.parts:
+    for part, own in avatar.part_faces().items():
         if part not in sequence.parts:
             raise DataError.of("meshes", part, expected="this part of the avatar", found=", ".join(sequence.parts))
         mesh = sequence.parts[part]
-        count = avatar.face_counts[part]
-        own = avatar.faces[first : first + count].cpu().numpy() - offset
-        if mesh.faces.shape != own.shape or not np.array_equal(mesh.faces, own):
-            raise DataError.of(
-                "meshes", f"{part}.faces", expected=f"the {count} faces the avatar was trained on", found="other faces"
-            )
-        first, offset = first + count, offset + avatar.vertex_counts[part]
+        if mesh.faces.shape != own.shape or not np.array_equal(mesh.faces, own.numpy()):
+            expected = f"the {len(own)} faces the avatar was trained on"
+            raise DataError.of("meshes", f"{part}.faces", expected=expected, found="other faces")
 
 
 def render_views(
-    avatar: Avatar, sequence: MeshSequence, views: Sequence[View], protocol: ProtocolConfig, *, device: str = "cpu"
+    avatar: MeshAvatar, sequence: MeshSequence, views: Sequence[View], protocol: ProtocolConfig, *, device: str = "cpu"
 ) -> Iterator[Picture]:
     """Render views one by one.
 

@@ -1,4 +1,4 @@
-"""Training of one avatar: Adam on all parameters, one view a step (paper, section 4.1; supplement A).
+"""Training of one avatar by any method: Adam on all parameters, one view a step (paper, section 4.1; supplement A).
 
 Every random number of a step comes from (seed, step), so a run that is cut off anywhere and resumed from its last
 checkpoint computes the same bits as an unbroken one (on the CPU, with the same number of threads). A step whose loss or
@@ -15,19 +15,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nbavatar.avatar.model import Anchor, Avatar
+from nbavatar.avatar.base import MeshAvatar
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.views import ViewStore, ViewStream
 from nbavatar.errors import NBAvatarError
 from nbavatar.training.adam import Adam
-from nbavatar.training.objective import step_loss
+from nbavatar.training.method import Method
 from nbavatar.training.preview import contact_sheet
-from nbavatar.training.schedule import Plan, plan_at, total_steps
+from nbavatar.training.schedule import Plan, total_steps
 
-__all__ = ["Store", "parameter_groups", "train"]
+__all__ = ["Store", "train"]
 
 _LOG_EVERY = 25
-_POSITION = "position"
 _ANCHOR_BYTES = 256_000_000  # most memory for kept face frames
 
 
@@ -47,32 +46,11 @@ class Store(Protocol):
         """Keep a picture."""
 
 
-def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]]:
-    """Adam groups with the rates of the supplement; each has `name` and `base`, the rate before any schedule."""
-    billboards, rates = avatar.billboards, config.rates
-    groups: list[tuple[str, float, list[nn.Parameter]]] = [
-        (_POSITION, rates.position, [billboards.mu]),
-        ("rotation", rates.rotation, [billboards.quat]),
-        ("scale", rates.scale, [billboards.log_scale]),
-        ("features", rates.features if config.deferred else rates.colour, [billboards.features]),
-        ("alpha", rates.alpha, [billboards.alpha_logit]),
-    ]
-    if avatar.unet is not None:
-        groups.append(("renderer", rates.renderer, list(avatar.unet.parameters())))
-    if avatar.refinement is not None:
-        groups.append(("refine", config.refine.rate, list(avatar.refinement.parameters())))
-    factor = config.rate_factor
-    return [
-        {"name": name, "params": params, "lr": base * factor, "base": base * factor} for name, base, params in groups
-    ]
-
-
 def train(
-    avatar: Avatar,
+    method: Method,
     views: ViewStore,
     count: int,
     meshes: Mapping[str, Tensor],
-    neighbours: Tensor | None,
     lpips: Callable[[Tensor, Tensor], Tensor] | None,
     config: TrainConfig,
     store: Store,
@@ -84,11 +62,10 @@ def train(
     """Train an avatar in place.
 
     Args:
-        avatar: in its initial state, on `device`.
+        method: with its avatar in its initial state, on `device`.
         views: training pictures; `count` of them.
         meshes: vertices per part over all frames, float32 (N, V, 3) [m].
-        neighbours: of every billboard, int64 (F, K) on `device`, or None when the term is off.
-        lpips: perceptual distance on `device`, or None when its weight is 0.
+        lpips: perceptual distance on `device`, or None when the method does without (`Method.lpips_net`).
         config: training options.
         store: checkpoints, events and previews.
         device: where the avatar computes.
@@ -96,20 +73,24 @@ def train(
         should_stop: asked before every step; True checkpoints and returns early.
 
     Returns:
-        Summary: `finished`, `steps`, `seconds`, `skipped`, `last` (logged values), `views`, `decoded`.
+        Summary: `finished`, `steps`, `seconds`, `skipped`, `last` (logged values), `views`, `decoded`, `primitives`,
+        `parameters` (trained numbers), `model_bytes` (of the avatar's tensors).
 
     Raises:
         NBAvatarError: too many non-finite steps in a row.
     """
-    groups = parameter_groups(avatar, config)
-    optimizer = Adam(groups)
+    avatar = method.avatar
+    state = store.load()
+    if state is not None:
+        avatar.restore(state["model"])  # first: the number of primitives may differ from the initial one
+        method.load_state_dict(state["method"])
+    groups = [{**group, "base": group["lr"]} for group in method.parameter_groups()]
+    optimizer = Adam(groups, eps=method.adam_eps)
     vertices = {part: meshes[part].to(device) for part in avatar.parts}
     anchors = _Anchors(avatar, vertices)
     clock = _Clock(config)
     step, skipped, in_a_row = 0, 0, 0
-    state = store.load()
     if state is not None:
-        avatar.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
         step, skipped, in_a_row = state["step"], state["skipped"], state["in_a_row"]
         clock.seconds_before = state["seconds"]
@@ -123,6 +104,7 @@ def train(
         store.save(
             {
                 "model": avatar.state_dict(),
+                "method": method.state_dict(),
                 "optimizer": optimizer.state_dict(),
                 "step": step,
                 "skipped": skipped,
@@ -136,23 +118,25 @@ def train(
         while not clock.done(step):
             if should_stop is not None and should_stop():
                 checkpoint()
-                return _summary(False, step, clock, skipped, last, count, views)
+                return _summary(False, step, clock, skipped, last, count, views, avatar)
             progress = clock.progress(step)
-            plan = plan_at(progress, config, side, step)
-            _set_rates(optimizer, plan)
+            plan = method.plan(progress, side, step)
+            _set_rates(optimizer, plan, progress)
             sample = stream.get(step, plan.shrink)
             anchor = anchors.get(sample.view.row, sample.view.frame)
             random = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
             optimizer.zero_grad()
-            total, terms, _ = step_loss(avatar, sample, anchor, neighbours, lpips, plan, config, random)
+            total, terms, aux = method.step_loss(sample, anchor, lpips, plan, random)
             good = bool(torch.isfinite(total))
             if good:
                 total.backward()
                 good = _finite_gradients(avatar)
             if good:
-                if config.clip > 0 and avatar.unet is not None:
-                    nn.utils.clip_grad_norm_(avatar.unet.parameters(), config.clip)
+                for group in optimizer.param_groups:
+                    if group.get("clip", 0.0) > 0:
+                        nn.utils.clip_grad_norm_(group["params"], group["clip"])
                 optimizer.step()
+                method.after_step(optimizer, aux, step, progress, random)
                 in_a_row = 0
             else:
                 skipped, in_a_row = skipped + 1, in_a_row + 1
@@ -178,19 +162,18 @@ def train(
     finally:
         stream.close()
     avatar.eval()
-    return _summary(True, step, clock, skipped, last, count, views)
+    return _summary(True, step, clock, skipped, last, count, views, avatar)
 
 
 class _Anchors:
     """Face frames of the frames seen last, in bounded memory; computed anew where a refinement moves the meshes."""
 
-    def __init__(self, avatar: Avatar, vertices: Mapping[str, Tensor]) -> None:
+    def __init__(self, avatar: MeshAvatar, vertices: Mapping[str, Tensor]) -> None:
         self._avatar, self._vertices = avatar, vertices
-        size = 17 * avatar.billboards.mu.element_size() * len(avatar.faces)  # T, R, k and the quaternion
-        self._most = 0 if avatar.refinement is not None else max(1, _ANCHOR_BYTES // max(1, size))
-        self._kept: OrderedDict[int, Anchor] = OrderedDict()
+        self._most = 1 if avatar.fixed_anchors else 0
+        self._kept: OrderedDict[int, Any] = OrderedDict()
 
-    def get(self, row: int, frame: str) -> Anchor:
+    def get(self, row: int, frame: str) -> Any:
         """Anchor of one frame."""
         if row in self._kept:
             self._kept.move_to_end(row)
@@ -198,6 +181,7 @@ class _Anchors:
         verts = {part: values[row] for part, values in self._vertices.items()}
         anchor = self._avatar.anchor(verts, frame)
         if self._most > 0:
+            self._most = max(1, _ANCHOR_BYTES // max(1, _tensor_bytes(anchor)))
             self._kept[row] = anchor
             if len(self._kept) > self._most:
                 self._kept.popitem(last=False)
@@ -242,12 +226,21 @@ class _PreviewTimes:
         return bool(passed)
 
 
-def _set_rates(optimizer: Adam, plan: Plan) -> None:
+def _tensor_bytes(values: Any) -> int:
+    """Memory [bytes] of the tensors in nested tuples."""
+    if isinstance(values, Tensor):
+        return values.numel() * values.element_size()
+    return sum(_tensor_bytes(value) for value in values) if isinstance(values, tuple) else 0
+
+
+def _set_rates(optimizer: Adam, plan: Plan, progress: float) -> None:
+    # A group with `final` decays exponentially to that factor, beside what the plan does to all groups.
+    progress = min(max(progress, 0.0), 1.0)
     for group in optimizer.param_groups:
-        group["lr"] = group["base"] * plan.rate * (plan.position_rate if group["name"] == _POSITION else 1.0)
+        group["lr"] = group["base"] * plan.rate * group.get("final", 1.0) ** progress
 
 
-def _finite_gradients(avatar: Avatar) -> bool:
+def _finite_gradients(avatar: MeshAvatar) -> bool:
     # A sum is finite only if all its terms are (up to overflow, which is as bad); far cheaper than isfinite().all().
     sums = [p.grad.sum() for p in avatar.parameters() if p.grad is not None]
     return bool(torch.isfinite(torch.stack(sums)).all()) if sums else True
@@ -266,8 +259,16 @@ def _json_safe(values: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def _summary(
-    finished: bool, step: int, clock: _Clock, skipped: int, last: Mapping[str, float], count: int, views: ViewStore
+    finished: bool,
+    step: int,
+    clock: _Clock,
+    skipped: int,
+    last: Mapping[str, float],
+    count: int,
+    views: ViewStore,
+    avatar: MeshAvatar,
 ) -> dict[str, Any]:
+    tensors = list(avatar.state_dict().values())
     return {
         "finished": finished,
         "steps": step,
@@ -277,4 +278,8 @@ def _summary(
         "views": count,
         "decoded": views.decoded,
         "cached_mb": round(views.cached_bytes / 1e6, 3),
+        "method": avatar.method,
+        "primitives": avatar.primitives,
+        "parameters": sum(parameter.numel() for parameter in avatar.parameters()),
+        "model_bytes": sum(tensor.numel() * tensor.element_size() for tensor in tensors),
     }

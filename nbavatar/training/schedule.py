@@ -25,14 +25,12 @@ class Plan(NamedTuple):
     Attributes:
         shrink: images are this many times smaller (a power of two).
         rate: factor on all learning rates.
-        position_rate: further factor on the rate of the billboard offsets.
         crop: side of the LPIPS crop [px], or None for the whole image.
         perceptual: whether LPIPS is computed.
     """
 
     shrink: int
     rate: float
-    position_rate: float
     crop: int | None
     perceptual: bool
 
@@ -62,4 +60,4 @@ def plan_at(progress: float, config: TrainConfig, side: int, step: int = 0) -> P
             rate = config.final_rate + (1.0 - config.final_rate) * 0.5 * (1.0 + math.cos(math.pi * turn))
     crop = None if progress < config.lpips_full_until or shrink > 1 else config.lpips_crop
     perceptual = config.weight_lpips > 0 and step % config.lpips_every == 0 and progress >= config.lpips_from
-    return Plan(shrink, rate, config.rates.position_final**progress, crop, perceptual)
+    return Plan(shrink, rate, crop, perceptual)

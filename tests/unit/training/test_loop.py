@@ -20,8 +20,10 @@ from nbavatar.data.sequences import MeshSequence, Part, read_sequence
 from nbavatar.data.views import ViewStore, views_of
 from nbavatar.errors import NBAvatarError
 from nbavatar.io.framepack import FramePack
-from nbavatar.training.loop import parameter_groups, train
-from nbavatar.training.setup import initial_avatar, neighbour_graph
+from nbavatar.training.billboards import parameter_groups
+from nbavatar.training.loop import train
+from nbavatar.training.method import create_method
+from nbavatar.training.setup import initial_avatar
 from nbavatar.training.state import RunFolder
 from tests.scenes.toy import sequence, write_scene
 
@@ -38,12 +40,13 @@ def run(scene: dict, config: TrainConfig, folder: Path, **options):
     coords = {k[: -len(".coords")]: v for k, v in np.load(scene["spectral"]).items() if k.endswith(".coords")}
     packs = [FramePack(path) for path in scene["packs"]]
     views = views_of(packs, meshes.frames, [pack.split("train") for pack in packs], layers=("rgb", "alpha"))
-    avatar = initial_avatar(meshes, coords, meshes.frames, config)
+    method = create_method(meshes, coords, views, config)
+    avatar = method.avatar
     store = RunFolder(folder, {"config": to_mapping(config)})
     verts = {part: torch.from_numpy(mesh.verts) for part, mesh in meshes.parts.items() if part in avatar.parts}
     summary = train(
-        avatar, ViewStore(packs, views, avatar.parts, 10**8), len(views), verts,
-        neighbour_graph(avatar, meshes, config), options.pop("lpips", None), config, store, **options,
+        method, ViewStore(packs, views, avatar.parts, 10**8), len(views), verts, options.pop("lpips", None), config,
+        store, **options,
     )  # fmt: skip
     return avatar, summary
 
@@ -88,6 +91,8 @@ def test_parameter_groups_have_the_rates_of_the_supplement(scene) -> None:
         config = replace(CONFIG, init="random", deferred=deferred)
         avatar = initial_avatar(meshes, {}, [], config)
         rates = {group["name"]: group["lr"] for group in parameter_groups(avatar, config)}
+        decays = {group["name"]: group["final"] for group in parameter_groups(avatar, config) if "final" in group}
+        assert decays == {"position": 0.01}
         expected = {"position": 1.6e-4, "rotation": 1e-3, "scale": 5e-3, "alpha": 5e-4}
         expected |= {"features": 5e-4, "renderer": 1e-3} if deferred else {"features": 2.5e-3}
         assert rates == expected

@@ -9,14 +9,11 @@ from nbavatar.training.schedule import plan_at, total_steps
 def test_paper_schedule_is_the_supplements() -> None:
     config = TrainConfig(schedule="paper")
     assert total_steps(config) == 400_000
-    assert plan_at(0.0, config, 1024) == (1, 1.0, 1.0, None, True)
+    assert plan_at(0.0, config, 1024) == (1, 1.0, None, True)
     assert plan_at(39_999 / 400_000, config, 1024).crop is None
     assert plan_at(40_000 / 400_000, config, 1024).crop == 256
     end = plan_at(1.0, config, 1024)
     assert end.rate == 1.0 and end.shrink == 1
-    assert end.position_rate == pytest.approx(0.01)
-    # gamma = 0.01^(1/N) a step, N steps
-    assert plan_at(0.5, config, 1024).position_rate == pytest.approx(0.1)
 
 
 def test_fast_schedule_goes_from_coarse_to_fine_and_ends_slow() -> None:

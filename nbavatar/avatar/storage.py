@@ -1,0 +1,92 @@
+"""One file that holds an avatar, whatever its kind, and the list of kinds.
+
+`model.pt` opens with ``torch.load(..., weights_only=True)``: tensors, numbers and text, nothing executable.
+"""
+
+import importlib
+import json
+import os
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from nbavatar.avatar.base import MeshAvatar
+from nbavatar.errors import DataError
+from nbavatar.io.atomic import atomic_write
+
+__all__ = ["FORMAT", "METHODS", "MethodModules", "load_avatar", "resolve", "save_avatar"]
+
+FORMAT = 1
+_KIND = "nbavatar avatar"
+
+
+class MethodModules(NamedTuple):
+    """Where a method lives: its avatar (`MeshAvatar`) and its training (`nbavatar.training.method.Method`), each as
+    `module:class`.
+    """
+
+    avatar: str
+    training: str
+
+
+# Imported by name, so that no method needs another's modules; `nbavatar.provenance.DYNAMIC` lists them too.
+METHODS: dict[str, MethodModules] = {
+    "billboards": MethodModules("nbavatar.avatar.model:Avatar", "nbavatar.training.billboards:BillboardTraining"),
+}
+
+
+def resolve(place: str) -> Any:
+    """The class at `module:class`."""
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def save_avatar(path: str | os.PathLike[str], avatar: MeshAvatar) -> None:
+    """Write an avatar to one file, atomically."""
+    content = {
+        "kind": _KIND,
+        "format": FORMAT,
+        "method": avatar.method,
+        "faces": avatar.part_faces(),
+        "vertex_counts": avatar.vertex_counts,
+        "record": json.dumps(avatar.record, sort_keys=True),
+        # Detached clones: a view would drag its whole storage into the file.
+        "state": {name: value.detach().cpu().clone() for name, value in avatar.state_dict().items() if name != "faces"},
+        **avatar.content(),
+    }
+    with atomic_write(path) as temporary:
+        torch.save(content, temporary)
+
+
+def load_avatar(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> Any:
+    """Read an avatar of any kind (`MeshAvatar`).
+
+    Raises:
+        DataError: missing, damaged, not an avatar, of another format version, or of a method that is not known.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise DataError.of(path, expected="an avatar (model.pt)", found="no such file") from error
+    except Exception as error:  # torch raises many kinds for damaged and for hostile files
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DataError.of(
+            path, expected="an avatar (model.pt)", found=f"a damaged or foreign file ({reason})"
+        ) from error
+    if not isinstance(content, dict) or content.get("kind") != _KIND:
+        raise DataError.of(path, "kind", expected=f"'{_KIND}'", found="something else")
+    if content["format"] != FORMAT:
+        raise DataError.of(
+            path, "format", expected=FORMAT, found=content["format"], fix="train it again with this version"
+        )
+    method = content.get("method", "billboards")
+    if method not in METHODS:
+        raise DataError.of(path, "method", expected=f"one of {', '.join(METHODS)}", found=method)
+    try:
+        state: dict[str, Tensor] = content["state"]
+        avatar: MeshAvatar = resolve(METHODS[method].avatar).rebuild(content, state, json.loads(content["record"]))
+        avatar.restore({**state, "faces": avatar.faces})
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise DataError.of(path, expected="a whole avatar", found=f"contents that disagree ({error})") from error
+    return avatar.to(device).eval()

@@ -1,0 +1,89 @@
+"""Training of the paper's avatar as a `Method`: rates of the supplement, the loss of section 3.4."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nbavatar.avatar.model import Anchor, Avatar
+from nbavatar.config.avatar import TrainConfig
+from nbavatar.data.sequences import MeshSequence
+from nbavatar.data.views import Sample, View
+from nbavatar.training.method import Method, StepLoss
+from nbavatar.training.objective import step_loss
+from nbavatar.training.schedule import Plan
+from nbavatar.training.setup import initial_avatar, neighbour_graph
+
+__all__ = ["BillboardTraining", "parameter_groups"]
+
+
+class BillboardTraining(Method):
+    """Neural billboards and their U-Net.
+
+    Attributes:
+        neighbours: of every billboard, int64 (F, K), or None when the term is off.
+    """
+
+    avatar: Avatar
+
+    def __init__(self, avatar: Avatar, neighbours: Tensor | None, config: TrainConfig) -> None:
+        super().__init__(avatar, config)
+        self.neighbours = neighbours
+
+    @classmethod
+    def create(
+        cls,
+        sequence: MeshSequence,
+        coords: Mapping[str, np.ndarray],
+        views: Sequence[View],
+        config: TrainConfig,
+        device: str,
+    ) -> "BillboardTraining":
+        """See `Method.create`."""
+        frames = [sequence.frames[row] for row in sorted({view.row for view in views})]
+        avatar = initial_avatar(sequence, coords, frames, config).to(device)
+        neighbours = neighbour_graph(avatar, sequence, config)
+        return cls(avatar, None if neighbours is None else neighbours.to(device), config)
+
+    def lpips_net(self) -> str | None:
+        """See `Method.lpips_net`."""
+        return self.config.lpips_net if self.config.weight_lpips > 0 else None
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """See `Method.parameter_groups`."""
+        return parameter_groups(self.avatar, self.config)
+
+    def step_loss(
+        self,
+        sample: Sample,
+        anchor: Anchor,
+        lpips: Callable[[Tensor, Tensor], Tensor] | None,
+        plan: Plan,
+        random: torch.Generator,
+    ) -> StepLoss:
+        """See `Method.step_loss`."""
+        return StepLoss(*step_loss(self.avatar, sample, anchor, self.neighbours, lpips, plan, self.config, random))
+
+
+def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]]:
+    """Adam groups with the rates of the supplement (`Method.parameter_groups`)."""
+    billboards, rates = avatar.billboards, config.rates
+    groups: list[dict[str, Any]] = [
+        {"name": "position", "lr": rates.position, "params": [billboards.mu], "final": rates.position_final},
+        {"name": "rotation", "lr": rates.rotation, "params": [billboards.quat]},
+        {"name": "scale", "lr": rates.scale, "params": [billboards.log_scale]},
+        {
+            "name": "features",
+            "lr": rates.features if config.deferred else rates.colour,
+            "params": [billboards.features],
+        },
+        {"name": "alpha", "lr": rates.alpha, "params": [billboards.alpha_logit]},
+    ]
+    if avatar.unet is not None:
+        network = list(avatar.unet.parameters())
+        groups.append({"name": "renderer", "lr": rates.renderer, "params": network, "clip": config.clip})
+    if avatar.refinement is not None:
+        groups.append({"name": "refine", "lr": config.refine.rate, "params": list(avatar.refinement.parameters())})
+    return [{**group, "lr": group["lr"] * config.rate_factor} for group in groups]
