@@ -11,7 +11,7 @@ import numpy as np
 
 from nbavatar.mesh.sides import faces_across, on_rim, sign_distances
 from nbavatar.mesh.topology import boundary_loops, vertex_components
-from nbavatar.mesh.tree import build_tree, extent, nearest, refit, separated
+from nbavatar.mesh.tree import build_tree, extent, in_box, nearest, refit, separated
 from nbavatar.mesh.winding import charge, crossings, is_closed, winding, winding_plain
 
 __all__ = ["DeformingMesh", "surface_points"]
@@ -113,9 +113,8 @@ class DeformingMesh:
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Whether each point (P, 3) [m] is inside, i.e. has a winding number above one half; (P,) bool."""
         self._fit()
-        low, high = self._bounds[0, :3], self._bounds[0, 3:]
         result = np.zeros(len(points), bool)
-        unsure = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+        unsure = np.flatnonzero(in_box(points, self._bounds[0, :3], self._bounds[0, 3:]))
         if len(unsure) and self._closed:
             count = crossings(np.ascontiguousarray(points[unsure]), self.verts, self._leaves, self._nodes, self._bounds)
             result[unsure] = count > 0.5

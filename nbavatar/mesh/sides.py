@@ -12,10 +12,17 @@ import numpy as np
 __all__ = ["faces_across", "on_rim", "sign_distances"]
 
 
-def on_rim(face: np.ndarray, weight: np.ndarray, faces: np.ndarray, rim: np.ndarray) -> np.ndarray:
+@numba.njit(cache=True, error_model="numpy")
+def on_rim(face, weight, faces, rim):
     """Whether the nearest point lies on a border edge or border vertex: all its corners with weight are on the rim."""
-    on = (rim[faces[np.maximum(face, 0)]] | (weight <= 1e-9)).all(axis=1)
-    return on & (face >= 0)
+    result = np.zeros(len(face), np.bool_)
+    for i in range(len(face)):
+        if face[i] >= 0:
+            on = True
+            for c in range(3):
+                on = on and (weight[i, c] <= 1e-9 or rim[faces[face[i], c]])
+            result[i] = on
+    return result
 
 
 def faces_across(faces: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-__all__ = ["build_tree", "extent", "nearest", "refit", "separated"]
+__all__ = ["build_tree", "extent", "in_box", "nearest", "refit", "separated"]
 
 _LEAF = 4
 _STACK = 64
@@ -53,6 +53,16 @@ def extent(verts, low, high):
         a0, a1, a2 = min(a0, x), min(a1, y), min(a2, z)
         b0, b1, b2 = max(b0, x), max(b1, y), max(b2, z)
     low[0], low[1], low[2], high[0], high[1], high[2] = a0, a1, a2, b0, b1, b2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def in_box(points, low, high):
+    """Which points (P, 3) lie in the box between two corners (3,), (P,) bool."""
+    result = np.zeros(len(points), np.bool_)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        result[i] = low[0] <= x and x <= high[0] and low[1] <= y and y <= high[1] and low[2] <= z and z <= high[2]
+    return result
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from nbavatar.mesh.bvh import DeformingMesh, surface_points
+from nbavatar.mesh.tree import in_box
 
 __all__ = ["Contacts", "Overlap", "estimate_overlap", "find_contacts", "measure_overlap"]
 
@@ -100,7 +101,7 @@ def _overlap(
     head_depth, head_distance = np.zeros(count[0]), np.full(count[0], np.inf)
     low, high = hand.box()
     points = head.verts[: count[0]]
-    boxed = ((points >= low - radius) & (points <= high + radius)).all(axis=1)
+    boxed = in_box(points, low - radius, high + radius)
     near = np.flatnonzero(boxed)
     if len(near):
         points = np.ascontiguousarray(points[near])
@@ -108,17 +109,17 @@ def _overlap(
             head_depth[near], head_distance[near] = _depths(hand, points, radius)
         else:
             local = np.cumsum(boxed) - 1
-            within = edges[0][boxed[edges[0]].all(axis=1)]
+            within = edges[0][boxed[edges[0][:, 0]] & boxed[edges[0][:, 1]]]
             head_depth[near], head_distance[near] = _quick(hand, points, local[within], radius)
     return Overlap(hand_depth, head_depth, hand_distance, head_distance)
 
 
 def _quick(mesh: DeformingMesh, points: np.ndarray, edges: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    longest = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1).max(initial=0.0)
-    distance, face, _ = mesh.signed(points, max(radius, 0.51 * float(longest)))
+    longest = _longest(points, edges)
+    distance, face, _ = mesh.signed(points, max(radius, 0.51 * longest))
     depth = np.maximum(-distance, 0.0)
     low, high = mesh.box()
-    far = (face < 0) & ((points >= low) & (points <= high)).all(axis=1)
+    far = (face < 0) & in_box(points, low, high)
     depth[face < 0] = 0.0
     if far.any():
         group = _groups(far, edges)
@@ -140,6 +141,17 @@ def _depths(mesh: DeformingMesh, points: np.ndarray, radius: float) -> tuple[np.
     if len(deep):
         distance[deep] = mesh.closest(np.ascontiguousarray(points[deep]), np.inf)[0]
     return np.where(inside, distance, 0.0), distance
+
+
+@numba.njit(cache=True)
+def _longest(points, edges):
+    """Length of the longest edge."""
+    square = 0.0
+    for e in range(len(edges)):
+        a, b = edges[e, 0], edges[e, 1]
+        d0, d1, d2 = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1], points[a, 2] - points[b, 2]
+        square = max(square, d0 * d0 + d1 * d1 + d2 * d2)
+    return np.sqrt(square)
 
 
 @numba.njit(cache=True)
@@ -201,7 +213,7 @@ def find_contacts(
             parts.append((p, normal, ids, weight, np.full(len(found), h), depth, np.repeat(found[:, None], 3, 1), one))
         low, high = hand.box()
         x = head.verts[movable]
-        boxed = movable[((x >= low - near) & (x <= high + near)).all(axis=1)]
+        boxed = movable[in_box(x, low - near, high + near)]
         if not len(boxed):
             continue
         x = head.verts[boxed]

@@ -19,10 +19,11 @@ from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.mesh.drawing import vertex_normals
 from nbavatar.mesh.topology import edges
 from nbavatar.physics.collision import Contacts, estimate_overlap, find_contacts, measure_overlap
+from nbavatar.physics.rigid import rigid_motion, rotation_matrix
 from nbavatar.physics.tissue import SoftSurface
 from nbavatar.physics.xpbd import relax
 
-__all__ = ["ContactNumbers", "ContactSolver", "FrameResult", "rigid_motion"]
+__all__ = ["ContactNumbers", "ContactSolver", "FrameResult"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,7 +169,7 @@ class ContactSolver:
             done += 1
         final = [self._posed(hand, pose[k], centre[k]) for k, hand in enumerate(hands)]
         self._repair(x, head, final, outward, active)
-        return self._result(x, head, final, pose, depth, done, len(active))
+        return self._result(x, head, outward, final, pose, depth, done, len(active))
 
     def _probe(self, head: np.ndarray, hands: list[np.ndarray]) -> tuple[float, FrameResult | None]:
         """Depth before, and the result if there is nothing to do."""
@@ -271,9 +272,10 @@ class ContactSolver:
         moving = np.zeros(self._count, bool)
         moving[active] = True
         inverse_mass = np.where(moving, self._inverse_mass, 0.0)
-        pairs = self.surface.edges[moving[self.surface.edges].any(axis=1)]
+        (a, b), (i, j, k) = self.surface.edges.T, self.surface.faces.T
+        pairs = self.surface.edges[moving[a] | moving[b]]
         lengths = np.linalg.norm(head[pairs[:, 0]] - head[pairs[:, 1]], axis=1)
-        faces = self.surface.faces[moving[self.surface.faces].all(axis=1)]
+        faces = self.surface.faces[moving[i] & moving[j] & moving[k]]
         return active, inverse_mass, pairs, lengths, faces, moving.astype(np.float64)
 
     def _relax(
@@ -319,8 +321,8 @@ class ContactSolver:
             )  # fmt: skip
 
     def _result(
-        self, x: np.ndarray, head: np.ndarray, hands: list[np.ndarray], pose: np.ndarray, depth: float, steps: int,
-        active: int,
+        self, x: np.ndarray, head: np.ndarray, outward: np.ndarray, hands: list[np.ndarray], pose: np.ndarray,
+        depth: float, steps: int, active: int,
     ) -> FrameResult:  # fmt: skip
         n = self.numbers
         self._head.move(x)
@@ -331,7 +333,7 @@ class ContactSolver:
             deepest = max(deepest, overlap.deepest)
             head_contact |= overlap.head_distance < n.touch
             hand_contact.append(overlap.hand_distance < n.touch)
-        self._label(x, hands, self._outward(head), head_contact, hand_contact)
+        self._label(x, hands, outward, head_contact, hand_contact)
         dent = float(np.linalg.norm(x - head, axis=1).max())
         shift = np.linalg.norm(pose[:, :3], axis=1).max()
         turn = np.linalg.norm(pose[:, 3:], axis=1).max()
@@ -354,7 +356,7 @@ class ContactSolver:
     def _posed(hand: np.ndarray, pose: np.ndarray, centre: np.ndarray) -> np.ndarray:
         if not pose.any():
             return hand
-        return (hand - centre) @ _rotation(pose[3:]).T + centre + pose[:3]
+        return (hand - centre) @ rotation_matrix(pose[3:]).T + centre + pose[:3]
 
 
 def _outwards(mesh: DeformingMesh, rest: np.ndarray) -> DeformingMesh:
@@ -362,24 +364,6 @@ def _outwards(mesh: DeformingMesh, rest: np.ndarray) -> DeformingMesh:
     corners = mesh.verts[mesh.closed_faces] - mesh.verts.mean(axis=0)
     volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     return mesh if volume >= 0 else DeformingMesh(rest, mesh.faces[:, ::-1])
-
-
-def rigid_motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares rotation (3, 3) and translation (3,) [m] that take points (V, 3) to points (V, 3) (Kabsch 1976)."""
-    a, b = source.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return rotation, b - rotation @ a
-
-
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a rotation vector [rad] (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
 def _gather(hands: list[np.ndarray], contacts: Contacts) -> np.ndarray:

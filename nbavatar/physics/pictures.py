@@ -3,7 +3,7 @@
 import numpy as np
 
 from nbavatar.mesh.drawing import draw_mesh, look_from, vertex_normals
-from nbavatar.physics.contact import rigid_motion
+from nbavatar.physics.rigid import rigid_motion
 
 __all__ = ["contact_picture"]
 

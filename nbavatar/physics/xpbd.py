@@ -14,7 +14,7 @@ import numpy as np
 __all__ = ["relax"]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def relax(
     x, rest, inverse_mass, active, support, edges, lengths, stretch, shear, ring, ring_ids, ring_weights, bend,
     faces, bulge, volume_stiffness, contacts, ids, weights, hand, pose, pose_inverse_mass, pose_stiffness, pose_bound,
@@ -57,6 +57,8 @@ def relax(
     pressed = np.zeros(len(ids))
     sheared = np.zeros((len(ids), 3))
     gradient = np.zeros((len(x) if volume_stiffness > 0.0 else 0, 3))
+    origin = rest[active[0]] if len(active) else rest[0]
+    volume = _volume(rest, origin, faces, gradient) if volume_stiffness > 0.0 else 0.0
     stretch_a = 1.0 / (stretch * h2) if stretch > 0.0 else 0.0
     shear_a = 1.0 / (shear * h2) if shear > 0.0 else 0.0
     for _ in range(iterations):
@@ -137,7 +139,9 @@ def relax(
             x[i, 2] -= f * s2
         # Volume: what is pressed in comes out beside, as far as the tissue resists compression.
         if volume_stiffness > 0.0:
-            volume_l += _volume(x, rest, inverse_mass, active, faces, bulge, gradient, volume_l, volume_stiffness * h2)
+            volume_l += _hold_volume(
+                x, inverse_mass, active, faces, bulge, gradient, origin, volume, volume_l, volume_stiffness * h2
+            )
         # Hands: towards their tracked pose, never beyond the bound.
         for k in range(len(pose)):
             for part in range(2):
@@ -166,7 +170,7 @@ def relax(
     return pressed
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _bound(pose, bound):
     for k in range(len(pose)):
         for part in range(2):
@@ -179,32 +183,35 @@ def _bound(pose, bound):
                 pose[k, c + 2] *= shrink
 
 
-@numba.njit(cache=True)
-def _volume(x, rest, inverse_mass, active, faces, bulge, gradient, impulse, stiffness):
+@numba.njit(cache=True, error_model="numpy")
+def _volume(x, origin, faces, gradient):
+    """Volume between faces and a point [m^3]; adds its derivative by each corner to `gradient`, of the closed region.
+
+    The derivative takes a third of a face's area vector for each of its corners: what the faces beyond the border of
+    the region would add to it is the same before and after, and left out.
+    """
+    total = 0.0
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        a0, a1, a2 = x[i, 0] - origin[0], x[i, 1] - origin[1], x[i, 2] - origin[2]
+        e0, e1, e2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+        g0, g1, g2 = x[k, 0] - x[i, 0], x[k, 1] - x[i, 1], x[k, 2] - x[i, 2]
+        n0, n1, n2 = (e1 * g2 - e2 * g1) / 6.0, (e2 * g0 - e0 * g2) / 6.0, (e0 * g1 - e1 * g0) / 6.0
+        total += a0 * n0 + a1 * n1 + a2 * n2
+        for c in range(3):
+            v = faces[f, c]
+            gradient[v, 0] += n0
+            gradient[v, 1] += n1
+            gradient[v, 2] += n2
+    return total
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _hold_volume(x, inverse_mass, active, faces, bulge, gradient, origin, volume, impulse, stiffness):
     """One projection of the volume constraint; returns the change of its impulse."""
     for s in range(len(active)):
         gradient[active[s]] = 0.0
-    o0, o1, o2 = rest[active[0], 0], rest[active[0], 1], rest[active[0], 2]
-    change = 0.0
-    for f in range(len(faces)):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        for now in range(2):
-            p = x if now == 1 else rest
-            a0, a1, a2 = p[i, 0] - o0, p[i, 1] - o1, p[i, 2] - o2
-            b0, b1, b2 = p[j, 0] - o0, p[j, 1] - o1, p[j, 2] - o2
-            c0, c1, c2 = p[k, 0] - o0, p[k, 1] - o1, p[k, 2] - o2
-            n0, n1, n2 = b1 * c2 - b2 * c1, b2 * c0 - b0 * c2, b0 * c1 - b1 * c0
-            volume = (a0 * n0 + a1 * n1 + a2 * n2) / 6.0
-            change += volume if now == 1 else -volume
-            if now == 1:
-                # One third of the face's area vector to each corner: the gradient of a closed region's volume.
-                n0 = ((b1 - a1) * (c2 - a2) - (b2 - a2) * (c1 - a1)) / 6.0
-                n1 = ((b2 - a2) * (c0 - a0) - (b0 - a0) * (c2 - a2)) / 6.0
-                n2 = ((b0 - a0) * (c1 - a1) - (b1 - a1) * (c0 - a0)) / 6.0
-                for v in (i, j, k):
-                    gradient[v, 0] += n0
-                    gradient[v, 1] += n1
-                    gradient[v, 2] += n2
+    change = _volume(x, origin, faces, gradient) - volume
     w = 0.0
     for s in range(len(active)):
         i = active[s]
@@ -222,7 +229,7 @@ def _volume(x, rest, inverse_mass, active, faces, bulge, gradient, impulse, stif
     return step
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _touch(
     x, start, inverse_mass, contacts, ids, weights, hand, pose, entry, pose_inverse_mass, centre, friction, pressed,
     sheared,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from nbavatar.mesh.bvh import DeformingMesh
-from nbavatar.physics.contact import ContactNumbers, ContactSolver, FrameResult, rigid_motion
+from nbavatar.physics.contact import ContactNumbers, ContactSolver, FrameResult
+from nbavatar.physics.rigid import rigid_motion
 from nbavatar.physics.sequence import enclosed_volume
 from nbavatar.physics.shapes import capsule_hand, press, round_head
 from nbavatar.physics.tissue import bed_stiffness, soft_surface, tissue_thickness
