@@ -1,0 +1,80 @@
+"""Smaller avatars made of a trained one: some billboards, some parts, smaller textures."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from nbavatar.avatar.billboards import Billboards
+from nbavatar.avatar.model import Avatar
+from nbavatar.tradeoff.textures import resample_textures
+
+__all__ = ["avatar_bytes", "keep_billboards", "keep_parts", "resize_textures"]
+
+_FAINTEST = 1e-6  # opacity whose logit stands for nothing; far below what the rasterizer draws
+
+
+def keep_billboards(avatar: Avatar, kept: Tensor) -> Avatar:
+    """The avatar with some of its billboards; parts without any are gone, renderer and refinement are shared.
+
+    Args:
+        avatar: trained.
+        kept: ascending indices of billboards, int64.
+    """
+    if len(kept) == len(avatar.faces):
+        return avatar
+    faces, first = {}, 0
+    for part, own in avatar.part_faces().items():
+        chosen = kept[(kept >= first) & (kept < first + len(own))] - first
+        if len(chosen):
+            faces[part] = own[chosen.cpu()]
+        first += len(own)
+    b = avatar.billboards
+    return _rebuilt(avatar, faces, [value[kept] for value in _values(b)], avatar.architecture.texels)
+
+
+def keep_parts(avatar: Avatar, parts: Sequence[str]) -> Avatar:
+    """The avatar with some of its parts."""
+    wanted = torch.tensor([part in parts for part in avatar.parts])
+    return keep_billboards(avatar, wanted[avatar.face_groups()].nonzero().squeeze(1).to(avatar.faces.device))
+
+
+def resize_textures(avatar: Avatar, texels: int) -> Avatar:
+    """The avatar with textures of another size (`nbavatar.tradeoff.textures`)."""
+    if texels == avatar.architecture.texels:
+        return avatar
+    b = avatar.billboards
+    with torch.no_grad():
+        shown = b.features if avatar.unet is not None else torch.sigmoid(b.features)
+        features, alpha = resample_textures(shown, b.alpha(), texels)
+        if avatar.unet is None:
+            features = torch.logit(features, eps=_FAINTEST)
+        values = [b.mu, b.quat, b.log_scale, features, torch.logit(alpha, eps=_FAINTEST)]
+    return _rebuilt(avatar, avatar.part_faces(), values, texels)
+
+
+def avatar_bytes(avatar: Avatar) -> int:
+    """Size of all its tensors [bytes]."""
+    tensors = [*avatar.parameters(), *avatar.buffers()]
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+
+
+def _values(b: Billboards) -> list[Tensor]:
+    return [b.mu, b.quat, b.log_scale, b.features, b.alpha_logit]
+
+
+def _rebuilt(avatar: Avatar, faces: dict[str, Tensor], values: Sequence[Tensor], texels: int) -> Avatar:
+    """An avatar of these billboards (values as in `_values`) with the renderer and refinement of another."""
+    mu, quat, log_scale, features, logits = (value.detach() for value in values)
+    billboards = Billboards(torch.ones_like(log_scale), features, logits)
+    with torch.no_grad():
+        for place, value in ((billboards.mu, mu), (billboards.quat, quat), (billboards.log_scale, log_scale)):
+            place.copy_(value)
+    architecture = dataclasses.replace(avatar.architecture, texels=texels)
+    # Built without a renderer, so that no second U-Net is made only to be dropped.
+    plain = dataclasses.replace(architecture, deferred=False)
+    counts = {part: avatar.vertex_counts[part] for part in faces}
+    result = Avatar(plain, faces, counts, billboards, refinement=avatar.refinement, record=avatar.record)
+    result.architecture, result.unet = architecture, avatar.unet
+    return result.to(mu.device).eval()
