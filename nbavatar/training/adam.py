@@ -73,6 +73,48 @@ class Adam:
                 maximize=False,
             )
 
+    def moments(self, parameter: Tensor) -> tuple[Tensor, Tensor] | None:
+        """First and second moment of a parameter, of its shape; None before its first update."""
+        state = self._state.get(self._index(parameter))
+        return None if state is None else (state[0], state[1])
+
+    @torch.no_grad()
+    def replace(self, old: Tensor, new: Tensor, source: Tensor | None = None, fresh: Tensor | None = None) -> None:
+        """Puts a parameter in another's place when rows are added, removed or rewritten; the step count goes on.
+
+        Args:
+            old: a parameter of the groups, (N, ...).
+            new: what takes its place, (N', ...).
+            source: row of `old` whose moments each row of `new` inherits, int64 (N',); None: the same rows.
+            fresh: rows of `new` that start with zero moments, bool (N',); None: no row.
+
+        Raises:
+            ValueError: `old` is not in the groups.
+        """
+        index = place = self._index(old)
+        for group in self.param_groups:
+            if place < len(group["params"]):
+                group["params"][place] = new
+                break
+            place -= len(group["params"])
+        if index not in self._state:
+            return
+        first, second, count = self._state[index]
+        moments = [first.clone(), second.clone()] if source is None else [first[source], second[source]]
+        if fresh is not None:
+            for moment in moments:
+                moment[fresh] = 0.0
+        self._state[index] = (moments[0], moments[1], count)
+
+    def _index(self, parameter: Tensor) -> int:
+        index = 0
+        for group in self.param_groups:
+            for known in group["params"]:
+                if known is parameter:
+                    return index
+                index += 1
+        raise ValueError("the optimizer does not know this parameter")
+
     def state_dict(self) -> dict[str, Any]:
         """Moments and step counts by the parameter's place in the groups."""
         return {"state": {index: list(state) for index, state in self._state.items()}}

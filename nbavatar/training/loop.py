@@ -22,7 +22,7 @@ from nbavatar.errors import NBAvatarError
 from nbavatar.training.adam import Adam
 from nbavatar.training.method import Method
 from nbavatar.training.preview import contact_sheet
-from nbavatar.training.schedule import Plan, total_steps
+from nbavatar.training.schedule import Plan
 
 __all__ = ["Store", "train"]
 
@@ -88,7 +88,7 @@ def train(
     optimizer = Adam(groups, eps=method.adam_eps)
     vertices = {part: meshes[part].to(device) for part in avatar.parts}
     anchors = _Anchors(avatar, vertices)
-    clock = _Clock(config)
+    clock = _Clock(method.total_steps(), config.max_minutes)
     step, skipped, in_a_row = 0, 0, 0
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
@@ -191,9 +191,9 @@ class _Anchors:
 class _Clock:
     """Progress by steps, or by time where a budget is given."""
 
-    def __init__(self, config: TrainConfig) -> None:
-        self._steps = total_steps(config)
-        self._budget = None if config.max_minutes is None else 60.0 * config.max_minutes
+    def __init__(self, steps: int, max_minutes: float | None) -> None:
+        self._steps = steps
+        self._budget = None if max_minutes is None else 60.0 * max_minutes
         self._started = time.monotonic()
         self.seconds_before = 0.0
 

@@ -18,7 +18,7 @@ from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
 from nbavatar.training.adam import Adam
-from nbavatar.training.schedule import Plan, plan_at
+from nbavatar.training.schedule import Plan, plan_at, total_steps
 
 __all__ = ["Method", "StepLoss", "create_method"]
 
@@ -82,6 +82,10 @@ class Method(ABC):
         Each has `name`, `params`, `lr` (the rate at the start), and may have `final` (factor on the rate at the end,
         reached exponentially) and `clip` (largest norm of its gradient).
         """
+
+    def total_steps(self) -> int:
+        """Number of steps when no time budget is given."""
+        return total_steps(self.config)
 
     def plan(self, progress: float, side: int, step: int) -> Plan:
         """Settings of one step (`nbavatar.training.schedule.plan_at`)."""
