@@ -1,6 +1,7 @@
 """Benchmarks of single kernels on a realistic scene; figures as JSON with --json.
 
     nbavatar bench raster    billboard rasterizer, forward and backward, against the reference
+    nbavatar bench splat     rasterizer of 3D Gaussians, forward and backward, against the reference
     nbavatar bench deform    contact physics, frames a second with and without contact
     nbavatar bench spectral  spectral coordinates of a head and hands
     nbavatar bench fit       multi-view refit, frames a second and millimetres
@@ -15,12 +16,13 @@ import sys
 
 __all__ = ["add_arguments", "main"]
 
-_KERNELS = ("raster", "deform", "spectral", "fit")
+_KERNELS = ("raster", "splat", "deform", "spectral", "fit")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the kernel's name; each kernel has options of its own."""
-    parser.usage = "nbavatar bench {raster,deform,spectral,fit} [--json] [options of the kernel, see --help after it]"
+    names = ",".join(_KERNELS)
+    parser.usage = f"nbavatar bench {{{names}}} [--json] [options of the kernel, see --help after it]"
     parser.add_argument("kernel", choices=_KERNELS, help="what to measure")
     parser.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
 

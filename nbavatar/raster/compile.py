@@ -26,7 +26,7 @@ from llvmlite import binding
 from numba import njit
 from numba.core import caching
 
-__all__ = ["FAST", "inlined", "kernel", "prepare", "run_workers"]
+__all__ = ["FAST", "inlined", "keep_kernels", "kernel", "prepare", "run_workers"]
 
 _LOG = logging.getLogger("nbavatar.raster")
 
@@ -36,12 +36,28 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 _SOURCES = ("binning.py", "compile.py", "cpu_kernels.py", "memory.py", "scalar.py", "vector.py")
 
 
+_HERE = Path(__file__).parent
+_OTHERS: dict[Path, tuple[str, ...]] = {}  # packages besides this one whose kernels are kept -> their sources
+
+
+def keep_kernels(package: Path, sources: tuple[str, ...]) -> None:
+    """Has another package's kernels kept as this one's are; to be called before they are defined.
+
+    Args:
+        package: its folder.
+        sources: files in it that the compiled code depends on, besides those of this package.
+    """
+    _OTHERS[package] = sources
+
+
 @cache
-def _digest() -> str:
-    """Digest of everything that the compiled code depends on."""
+def _digest(package: Path) -> str:
+    """Digest of everything that a package's compiled code depends on."""
     state = hashlib.sha256()
     for name in _SOURCES:
-        state.update((Path(__file__).parent / name).read_bytes())
+        state.update((_HERE / name).read_bytes())
+    for name in _OTHERS.get(package, ()):
+        state.update((package / name).read_bytes())
     host = (numba.__version__, platform.machine(), platform.python_version(), binding.get_host_cpu_name())
     state.update(repr(host).encode())
     state.update(binding.get_host_cpu_features().flatten().encode())
@@ -49,18 +65,18 @@ def _digest() -> str:
 
 
 @cache
-def cache_folder() -> Path:
-    """First writable place for compiled code."""
+def cache_folder(package: Path = _HERE) -> Path:
+    """First writable place for a package's compiled code."""
     candidates = []
     if os.environ.get("NUMBA_CACHE_DIR"):
         candidates.append(Path(os.environ["NUMBA_CACHE_DIR"]) / "nbavatar")
-    candidates.append(Path(__file__).parent / "__pycache__")
+    candidates.append(package / "__pycache__")
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     candidates.append(Path(home) / "nbavatar")
     candidates.append(Path(tempfile.gettempdir()) / f"nbavatar-{os.getuid()}")
     for folder in candidates:
         with contextlib.suppress(OSError):
-            folder = folder / f"raster-{_digest()}"
+            folder = folder / f"{package.name}-{_digest(package)}"
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 return folder
@@ -68,23 +84,24 @@ def cache_folder() -> Path:
 
 
 class _Locator(caching._CacheLocator):
-    """Tells Numba where the kernels of this package are kept and when they are stale."""
+    """Tells Numba where the kernels of a package are kept and when they are stale."""
 
     def __init__(self, py_func: Any, py_file: str) -> None:
         self._lineno = py_func.__code__.co_firstlineno
+        self._package = Path(py_file).parent
 
     def get_cache_path(self) -> str:
-        return str(cache_folder())
+        return str(cache_folder(self._package))
 
     def get_source_stamp(self) -> str:
-        return _digest()
+        return _digest(self._package)
 
     def get_disambiguator(self) -> str:
         return str(self._lineno)
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> "_Locator | None":
-        return cls(py_func, py_file) if Path(py_file).parent == Path(__file__).parent else None
+        return cls(py_func, py_file) if Path(py_file).parent in {_HERE, *_OTHERS} else None
 
 
 caching.CodeLibraryCacheImpl._locator_classes.insert(0, _Locator)
@@ -116,28 +133,30 @@ _READY: set[str] = set()
 _READY_LOCK = threading.Lock()
 
 
-def prepare(name: str, kernels: dict[Any, tuple[Any, ...]]) -> None:
+def prepare(name: str, kernels: dict[Any, tuple[Any, ...]], package: Path = _HERE) -> None:
     """Loads kernels from disk, or compiles them and stores them there.
 
     Args:
         name: of this set of kernels.
         kernels: dispatcher -> argument types.
+        package: whose kernels they are.
     """
-    if name in _READY:
+    key = f"{package.name} {name}"
+    if key in _READY:
         return
     with _READY_LOCK:
-        if name in _READY:
+        if key in _READY:
             return
-        stamp = cache_folder() / f"{name}.ready"
+        stamp = cache_folder(package) / f"{name}.ready"
         if stamp.exists():
             _compile(kernels)
         else:
-            with _locked(cache_folder() / "compile.lock"):
+            with _locked(cache_folder(package) / "compile.lock"):
                 if not stamp.exists():
                     _LOG.warning("compiling the rasterizer's %s kernels, once for this machine", name)
                 _compile(kernels)
                 stamp.touch()
-        _READY.add(name)
+        _READY.add(key)
 
 
 def _compile(kernels: dict[Any, tuple[Any, ...]]) -> None:

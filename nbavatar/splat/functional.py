@@ -124,9 +124,15 @@ def render_gaussians(
 def _backend(name: str, device: torch.device) -> _Blend:
     if name not in _BACKENDS:
         raise DataError.of(_WHERE, "backend", expected=f"one of {', '.join(_BACKENDS)}", found=repr(name))
-    if name == "cpu" and device.type != "cpu":
-        raise DeviceError.of(_WHERE, "backend", expected=f"tensors on {name}", found=f"tensors on {device.type}")
-    return blend_reference
+    if name == "auto":
+        name = "cpu" if device.type == "cpu" else "reference"
+    if name == "reference":
+        return blend_reference
+    if name == "cpu" and device.type == "cpu":
+        from nbavatar.splat.cpu import blend_cpu  # Numba is loaded only when it is needed
+
+        return blend_cpu
+    raise DeviceError.of(_WHERE, "backend", expected=f"tensors on {name}", found=f"tensors on {device.type}")
 
 
 def _degree(colours: Tensor, sh_degree: int | None) -> int | None:

@@ -1,0 +1,177 @@
+"""CPU backend: Numba kernels behind a torch autograd function.
+
+Deterministic: the same inputs give the same bytes, forward and backward, whatever the number of
+threads.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numba import types
+from torch import Tensor
+
+from nbavatar.raster import binning
+from nbavatar.raster.compile import prepare, run_workers
+from nbavatar.raster.projection import Projection as PatchProjection
+from nbavatar.splat import cpu_kernels
+from nbavatar.splat.lanes import LANES
+from nbavatar.splat.projection import FAINTEST, Projection, support_box
+from nbavatar.splat.reference import SplatSettings
+
+__all__ = ["blend_cpu", "count_samples"]
+
+_SCRATCH = 1 << 26  # bytes of notes a worker may use; fewer rows are worked on at once beyond it
+
+
+def blend_cpu(
+    projection: Projection, rank: Tensor, opacities: Tensor, colours: Tensor, settings: SplatSettings
+) -> tuple[Tensor, Tensor]:
+    """Blends projected Gaussians front to back; arguments and results as `blend_reference`.
+
+    Works in the dtype of `opacities` and `colours`, float32 or float64, and returns it.
+
+    Raises:
+        DeviceError: the memory needed is not there.
+    """
+    return _Blend.apply(projection.form, opacities.contiguous(), colours.contiguous(), projection, rank, settings)
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, form, opacities, colours, projection, rank, settings):
+        scene = _Scene(projection, rank, opacities, colours, settings)
+        ctx.scene = scene
+        ctx.save_for_backward(opacities, colours)
+        return scene.forward()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *grads):
+        _ = ctx.saved_tensors  # raises if a tensor was changed in place since the forward pass
+        return *ctx.scene.backward(*grads), None, None, None
+
+
+def count_samples(
+    projection: Projection, rank: Tensor, opacities: Tensor, colours: Tensor, settings: SplatSettings
+) -> int:
+    """Number of hits that are blended into the image."""
+    scene = _Scene(projection, rank, opacities.detach().contiguous(), colours.detach().contiguous(), settings)
+    return scene.replay(torch.zeros(4, settings.height, settings.width, dtype=scene.dtype))[1]
+
+
+class _Scene:
+    """One camera's Gaussians, binned, and the arrays that the kernels share."""
+
+    def __init__(
+        self, projection: Projection, rank: Tensor, opacities: Tensor, colours: Tensor, settings: SplatSettings
+    ) -> None:
+        s = self.settings = settings
+        self.dtype = colours.dtype
+        _prepare(self.dtype)
+        self.form = projection.form.detach().numpy()
+        self.opacities, self.colours = opacities.detach().numpy(), colours.detach().numpy()
+        reach, box = support_box(projection, opacities.detach(), s.alpha_min)
+        patches = _patches(projection.form.detach(), opacities.detach(), reach, box)
+        self.bins = binning.bin_billboards(patches, rank, 1, s.width, s.height, 1.0, torch.float64, by_nearest=False)
+        limits = [0, 1, max(s.alpha_min, FAINTEST), s.alpha_max, s.t_min]
+        self.limits = torch.tensor(limits, dtype=self.dtype).numpy()
+
+    def forward(self) -> tuple[Tensor, Tensor]:
+        s = self.settings
+        image = torch.empty(3, s.height, s.width, dtype=self.dtype)
+        alpha = torch.empty(s.height, s.width, dtype=self.dtype)
+        nothing = np.zeros((0, 0, 0), self.limits.dtype)
+        self._traverse(image.numpy(), alpha.numpy(), nothing, nothing.reshape(-1), replay=False)
+        return image, alpha
+
+    def backward(self, grad_image: Tensor, grad_alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Gradients by form, opacities and colours."""
+        b = self.bins
+        parts, _ = self.replay(torch.cat([grad_image, grad_alpha[None]]).to(self.dtype))
+        grad_form = torch.empty(self.form.shape, dtype=torch.float64)
+        grad_opacities = torch.empty(self.opacities.shape, dtype=self.dtype)
+        grad_colours = torch.empty(self.colours.shape, dtype=self.dtype)
+        cpu_kernels.gather_parts(
+            b.sequence, b.first, b.where, parts.reshape(-1, cpu_kernels.PARTS), self.form, self.opacities,
+            grad_form.numpy(), grad_opacities.numpy(), grad_colours.numpy(),
+        )  # fmt: skip
+        return grad_form, grad_opacities, grad_colours
+
+    def replay(self, grads: Tensor) -> tuple[np.ndarray, int]:
+        """Repeats the blending; what each tile adds to the gradients of its Gaussians, and the number of hits."""
+        entries = len(self.bins.members)
+        size = entries * cpu_kernels.PARTS
+        binning.require_memory(size * self.limits.itemsize, f"the gradients of {entries} entries in tiles")
+        parts = torch.empty(size, dtype=self.dtype).numpy()
+        empty = np.zeros((0, 0, 0), self.limits.dtype)
+        hits = self._traverse(empty, empty.reshape(0, 0), grads.contiguous().numpy(), parts, replay=True)
+        return parts, hits
+
+    def _traverse(
+        self, image: np.ndarray, alpha: np.ndarray, grads: np.ndarray, parts: np.ndarray, *, replay: bool
+    ) -> int:
+        s, b = self.settings, self.bins
+        across = -(-s.width // binning.TILE_WIDTH)
+        lengths = np.diff(b.start)
+        tiles = np.argsort(-lengths, kind="stable").astype(np.int32)  # the longest first: no worker ends late
+        rows, chunks = binning.TILE_HEIGHT, 0
+        if replay:
+            longest = int(lengths.max(initial=0))
+            row = longest * cpu_kernels.CHUNKS * (2 * LANES * self.limits.itemsize + 8)
+            rows = int(np.clip(_SCRATCH // max(1, row), 1, binning.TILE_HEIGHT))
+            chunks = longest * cpu_kernels.CHUNKS * rows
+        reals = 6 * (binning.TILE_WIDTH * rows + LANES) + 2 * LANES * chunks
+        binning.require_memory(
+            torch.get_num_threads() * (reals * self.limits.itemsize + 8 * chunks), f"notes of {chunks} rows of hits"
+        )
+        shape = np.array([s.width, s.height, across, rows, int(replay)], np.int64)
+        turn = np.zeros(1, np.int64)
+
+        def work(_: int) -> int:
+            status = np.zeros(1, np.int64)
+            cpu_kernels.traverse(
+                turn, tiles, b.start, b.members, b.record.reshape(-1), b.box, self.colours.reshape(-1), self.limits,
+                shape, image, alpha, grads, parts, torch.empty(reals, dtype=self.dtype).numpy(),
+                torch.empty(2 * chunks, dtype=torch.int32).numpy(), status,
+            )  # fmt: skip
+            return int(status[0])
+
+        return sum(run_workers(work))
+
+
+def _patches(form: Tensor, opacities: Tensor, reach: Tensor, box: Tensor) -> PatchProjection:
+    """The Gaussians as the flat patches |u|, |v| <= reach that enclose them, for the tiles' lists.
+
+    Their "inverse depth" is `reach` everywhere, so a patch ends where its texture coordinates are 1.
+    """
+    p, s, k, x, y = form.unbind(-1)
+    zero = torch.zeros_like(p)
+    plane = torch.stack([p, s, -(p * x + s * y), zero, k, -k * y, zero, zero, reach], -1).reshape(-1, 3, 3)
+    ones = torch.ones_like(p)
+    return PatchProjection(plane, opacities.double(), ones, ones, box)
+
+
+def _prepare(dtype: torch.dtype) -> None:
+    """Has every kernel compiled for a dtype."""
+    real = types.float32 if dtype == torch.float32 else types.float64
+
+    def array(kind, dimensions: int = 1):
+        return types.Array(kind, dimensions, "C")
+
+    i32, i64, f64 = types.int32, types.int64, types.float64
+    prepare(
+        f"{real}",
+        {
+            cpu_kernels.traverse: (
+                array(i64), array(i32), array(i64), array(i32), array(f64), array(i32, 2), array(real), array(real),
+                array(i64), array(real, 3), array(real, 2), array(real, 3), array(real), array(real), array(i32),
+                array(i64),
+            ),
+            cpu_kernels.gather_parts: (
+                array(i32), array(i64), array(i64), array(real, 2), array(f64, 2), array(real), array(f64, 2),
+                array(real), array(real, 2),
+            ),
+        },
+        Path(__file__).parent,
+    )  # fmt: skip
