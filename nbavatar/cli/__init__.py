@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 
 from nbavatar import __version__
+from nbavatar.cli.warm import call, takes
 from nbavatar.errors import NBAvatarError, did_you_mean
 
 __all__ = ["VERBS", "main"]
@@ -33,8 +34,12 @@ VERBS = {
     "speed": "time rasterization and neural rendering of an avatar",
     "table": "one table of the paper, printed and reproduced values side by side",
     "protocol-sensitivity": "how the figures of one render move with the protocol",
+    "figure": "one figure for print: comparisons, features, cross-reenactment, contact, curves, Pareto fronts",
+    "reenact": "drive one subject by another's poses",
+    "video": "a turntable or a driven sequence as mp4",
     "report": "one self-contained HTML page with tables and pictures",
     "bench": "benchmarks of single kernels: raster, deform, spectral, fit",
+    "warm": "run a command, such as snakemake, in which the verbs that need torch start at once",
     "doctor": "what this machine can do, and what is missing for which stage",
     "schema": "write the configuration's JSON schema and reference page",
 }
@@ -52,6 +57,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         print(f"nbavatar: error: unknown verb '{verb}'; {did_you_mean(verb, VERBS)}", file=sys.stderr)
         return 2
+    if argv is None and takes(verb):
+        return call(arguments)
     try:
         module = importlib.import_module(f"nbavatar.cli.{verb.replace('-', '_')}")
         own = argparse.ArgumentParser(
