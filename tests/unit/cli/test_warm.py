@@ -4,12 +4,9 @@ import json
 import subprocess
 import sys
 
-import psutil
-
 # The command that runs under the server; one for all checks, because starting the server loads torch.
 _SCRIPT = """
 import json, os, subprocess, sys, time
-import psutil
 
 folder = sys.argv[1]
 run = [sys.executable, "-m", "nbavatar"]
@@ -76,4 +73,3 @@ def test_without_a_command_is_a_clear_line(capsys):
 
     assert main(["warm"]) == 2
     assert "expected a command after `--`" in capsys.readouterr().err
-
