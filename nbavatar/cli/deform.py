@@ -14,7 +14,7 @@ Writes a mesh sequence: head.verts deformed, hands with a small rigid correction
   head_rigid                 float32 [N, V, 3] [m]  the head that came in
   contact.<part>             bool [N, V]            nearer to the other part than the touch distance
   correction.<hand>          float64 [N, 6]         translation [m] and rotation vector [rad] about the hand's centroid
-  residual.depth_before, residual.depth_after       [N] [m] deepest vertex of either part inside the other
+  residual.depth_before, residual.depth_after       [N] [m] deepest vertex or edge of either part inside the other
   residual.exceeded          bool [N]               the motion needed is over a bound, or a depth over 2 x tolerance
                                                     is left
   residual.finite            bool [N]               False: the frame holds NaN and is passed on as it is

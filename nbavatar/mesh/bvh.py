@@ -12,7 +12,7 @@ import numpy as np
 from nbavatar.mesh.sides import faces_across, on_rim, sign_distances
 from nbavatar.mesh.topology import boundary_loops, vertex_components
 from nbavatar.mesh.tree import build_tree, extent, in_box, nearest, refit, separated
-from nbavatar.mesh.winding import charge, crossings, is_closed, winding, winding_plain
+from nbavatar.mesh.winding import charge, crossings, inner_middles, is_closed, winding, winding_plain
 
 __all__ = ["DeformingMesh", "surface_points"]
 
@@ -123,6 +123,16 @@ class DeformingMesh:
             result[unsure] = self.winding(points[unsure]) > 0.5
         return result
 
+    def dips(self, points: np.ndarray, edges: np.ndarray) -> np.ndarray:
+        """Where edges (E, 2) between points (V, 3) [m] that lie outside dip into the mesh.
+
+        Returns:
+            (E,) in (0, 1): the middle of the first stretch inside, as a share of the way to the second end; NaN where
+            there is none, or an end lies inside.
+        """
+        self._fit()
+        return inner_middles(points, edges, self.verts, self._leaves, self._nodes, self._bounds)
+
     def winding(self, points: np.ndarray) -> np.ndarray:
         """Generalised winding number of each point (P, 3) [m], with holes closed; (P,) float64."""
         points = np.ascontiguousarray(points)
@@ -135,7 +145,7 @@ class DeformingMesh:
         return winding(points, self.verts, self._leaves, self._nodes, self._dipoles)
 
     def clear_of(self, other: "DeformingMesh", distance: float) -> bool:
-        """True if nothing of either mesh is inside the other, and nothing is nearer to the other than `distance` [m].
+        """True if nothing of either mesh is inside the other, and they are farther apart than `distance` [m].
 
         False says nothing. Where the boxes of single faces (those that close holes too) are all farther apart, no
         surface crosses the other, so one vertex of each connected piece answers for the whole piece.

@@ -9,7 +9,7 @@ stays symmetric positive semi-definite with non-positive off-diagonal entries.
 import numpy as np
 import scipy.sparse
 
-from nbavatar.errors import require
+from nbavatar.errors import DataError, require
 
 __all__ = ["cotangent_laplacian", "robust_laplacian"]
 
@@ -22,18 +22,44 @@ def robust_laplacian(verts: np.ndarray, faces: np.ndarray) -> tuple[scipy.sparse
 
     Args:
         verts: positions [m], shape (V, 3). Every vertex must be used by a face.
-        faces: vertex ids, shape (F, 3), int64; faces that name a vertex twice are ignored.
+        faces: vertex ids, shape (F, 3), int64; faces that name a vertex twice are ignored, but count as use.
 
     Returns:
         The stiffness matrix (V, V), symmetric, positive semi-definite, rows summing to 0 [dimensionless], and the
         lumped mass, positive, shape (V,) [m^2], summing to the area of the (mollified) surface.
+
+    Raises:
+        DataError: no face with three different vertices, a vertex without a face, positions that are not finite or all
+            in one place.
     """
     package = require("robust_laplacian", "robust_laplacian", "spectral coordinates")
     faces = np.asarray(faces, np.int64)
     repeated = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
-    verts = np.ascontiguousarray(verts, np.float64)
-    stiffness, mass = package.mesh_laplacian(verts, np.ascontiguousarray(faces[~repeated]), mollify_factor=_MOLLIFY)
-    return scipy.sparse.csc_matrix((stiffness + stiffness.T) * 0.5), mass.diagonal()
+    verts = np.asarray(verts, np.float64)
+    size = _checked_size(verts, faces, ~repeated)
+    # The operator does not depend on place and size; the package's own arithmetic does, far out and at extreme sizes.
+    unit = np.ascontiguousarray((verts - verts.mean(axis=0)) / size)
+    stiffness, mass = package.mesh_laplacian(unit, np.ascontiguousarray(faces[~repeated]), mollify_factor=_MOLLIFY)
+    return scipy.sparse.csc_matrix((stiffness + stiffness.T) * 0.5), mass.diagonal() * size**2
+
+
+def _checked_size(verts: np.ndarray, faces: np.ndarray, proper: np.ndarray) -> float:
+    """Largest extent of a mesh along an axis [m]; refuses what has no Laplacian."""
+    where = "Laplacian"
+    if not np.isfinite(verts).all():
+        row = int(np.argwhere(~np.isfinite(verts).all(axis=1))[0, 0])
+        raise DataError.of(where, "verts", expected="finite numbers", found=f"NaN or infinity at vertex {row}")
+    if not proper.any():
+        raise DataError.of(where, "faces", expected="a face with three different vertices", found="none")
+    used = np.zeros(len(verts), bool)
+    used[faces.ravel()] = True
+    if not used.all():
+        raise DataError.of(where, "verts", expected="every vertex used by a face",
+                           found=f"vertex {int(np.argmin(used))} is not")  # fmt: skip
+    size = float(np.ptp(verts, axis=0).max())
+    if not size > 0:
+        raise DataError.of(where, "verts", expected="a surface", found="all vertices in one place")
+    return size
 
 
 def cotangent_laplacian(verts: np.ndarray, faces: np.ndarray) -> tuple[scipy.sparse.csc_matrix, np.ndarray]:

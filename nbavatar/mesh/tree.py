@@ -105,7 +105,7 @@ def _box_of(verts, faces, f, box):
 
 @numba.njit(cache=True, error_model="numpy")
 def separated(verts, faces, nodes, bounds, other_verts, other_faces, other_nodes, other_bounds, distance):
-    """True if the boxes of single faces already show that two meshes are nowhere nearer than `distance` [m].
+    """True if the boxes of single faces already show that two meshes are everywhere farther apart than `distance` [m].
 
     Both trees are descended together; False says nothing: the faces may still be apart.
     """
@@ -117,16 +117,16 @@ def separated(verts, faces, nodes, bounds, other_verts, other_faces, other_nodes
     while top > 0:
         top -= 1
         i, j = pairs[top, 0], pairs[top, 1]
-        if _between(bounds, i, other_bounds, j) >= limit:
+        if _between(bounds, i, other_bounds, j) > limit:
             continue
         if nodes[i, 2] < 0 and other_nodes[j, 2] < 0:
             for f in range(nodes[i, 0], nodes[i, 0] + nodes[i, 1]):
                 _box_of(verts, faces, f, one)
-                if _between(one, 0, other_bounds, j) >= limit:
+                if _between(one, 0, other_bounds, j) > limit:
                     continue
                 for g in range(other_nodes[j, 0], other_nodes[j, 0] + other_nodes[j, 1]):
                     _box_of(other_verts, other_faces, g, two)
-                    if _between(one, 0, two, 0) < limit:
+                    if _between(one, 0, two, 0) <= limit:
                         return False
         elif other_nodes[j, 2] < 0 or (nodes[i, 2] >= 0 and nodes[i, 1] >= other_nodes[j, 1]):
             pairs[top, 0], pairs[top, 1] = nodes[i, 2], j

@@ -1,4 +1,4 @@
-"""Inside tests against a closed surface: signed crossings of a ray, and the generalised winding number.
+"""What is inside a closed surface: points, by signed crossings of a ray or the generalised winding number; edges.
 
 For a surface without a border both are the same integer. A ray costs a few visits of the tree, so it is asked first;
 where it runs along an edge or a corner, or the surface has a border, the winding number decides (Jacobson et al. 2013,
@@ -10,7 +10,7 @@ import math
 import numba
 import numpy as np
 
-__all__ = ["charge", "crossings", "is_closed", "winding", "winding_plain"]
+__all__ = ["charge", "crossings", "inner_middles", "is_closed", "winding", "winding_plain"]
 
 _STACK = 64
 # A cluster farther than this many of its radii is taken as one dipole.
@@ -100,6 +100,68 @@ def crossings(points, verts, faces, nodes, bounds):
                     result[i] = np.nan
                 else:
                     result[i] += 1.0 if facing > 0.0 else -1.0
+    return result
+
+
+@numba.njit(cache=True, error_model="numpy")
+def inner_middles(points, edges, verts, faces, nodes, bounds):
+    """Where edges that end outside a surface dip into it.
+
+    Args:
+        points: positions [m], (V, 3); edges (E, 2) into them.
+
+    Returns:
+        (E,) float64 in (0, 1): the middle of the first stretch inside, as a share of the way to the second end; NaN
+        where there is none, or an end lies inside.
+    """
+    result = np.full(len(edges), np.nan)
+    stack = np.zeros(_STACK, np.int64)
+    for i in range(len(edges)):
+        p, q = points[edges[i, 0]], points[edges[i, 1]]
+        d0, d1, d2 = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+        first, second, enters = np.inf, np.inf, False
+        stack[0] = 0
+        top = 1
+        while top > 0:
+            top -= 1
+            k = stack[top]
+            near, far = 0.0, 1.0
+            for c in range(3):
+                d = q[c] - p[c]
+                if d == 0.0:
+                    if p[c] < bounds[k, c] or p[c] > bounds[k, 3 + c]:
+                        far = -1.0
+                else:
+                    a, b = (bounds[k, c] - p[c]) / d, (bounds[k, 3 + c] - p[c]) / d
+                    near, far = max(near, min(a, b)), min(far, max(a, b))
+            if near > far + _EDGE:
+                continue
+            if nodes[k, 2] >= 0:
+                stack[top], stack[top + 1] = nodes[k, 2], nodes[k, 3]
+                top += 2
+                continue
+            for f in range(nodes[k, 0], nodes[k, 0] + nodes[k, 1]):
+                a, b, c = verts[faces[f, 0]], verts[faces[f, 1]], verts[faces[f, 2]]
+                e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+                g0, g1, g2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+                n0, n1, n2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
+                facing = d0 * n0 + d1 * n1 + d2 * n2
+                if facing == 0.0:
+                    continue
+                s0, s1, s2 = a[0] - p[0], a[1] - p[1], a[2] - p[2]
+                r0, r1, r2 = s1 * d2 - s2 * d1, s2 * d0 - s0 * d2, s0 * d1 - s1 * d0
+                wb = (g0 * r0 + g1 * r1 + g2 * r2) / facing
+                wc = -(e0 * r0 + e1 * r1 + e2 * r2) / facing
+                t = (s0 * n0 + s1 * n1 + s2 * n2) / facing
+                if min(1.0 - wb - wc, wb, wc) < -_EDGE or t < 0.0 or t > 1.0:
+                    continue
+                # A crossing on an edge of the surface is met once for each of its two faces.
+                if t < first - _EDGE:
+                    first, second, enters = t, first, facing < 0.0
+                elif t > first + _EDGE:
+                    second = min(second, t)
+        if enters and second <= 1.0:
+            result[i] = 0.5 * (first + second)
     return result
 
 

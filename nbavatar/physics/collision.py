@@ -8,7 +8,7 @@ import numpy as np
 from nbavatar.mesh.bvh import DeformingMesh, surface_points
 from nbavatar.mesh.tree import in_box
 
-__all__ = ["Contacts", "Overlap", "estimate_overlap", "find_contacts", "measure_overlap"]
+__all__ = ["Contacts", "Overlap", "deepest_edge", "estimate_overlap", "find_contacts", "measure_overlap"]
 
 # Steps by which the way out of a hand is searched along the inward normal [m].
 _MARCH = np.arange(1, 17) * 0.002
@@ -173,6 +173,21 @@ def _groups(member, edges):
     return parent
 
 
+def deepest_edge(head: DeformingMesh, hand: DeformingMesh, edges: tuple[np.ndarray, np.ndarray]) -> float:
+    """How deep edges lie inside the other part whose ends are outside it [m].
+
+    Args:
+        edges: edges of head and hand to look at, (E, 2) and (Eh, 2) int64.
+    """
+    deepest = 0.0
+    for mesh, other, pairs in ((head, hand, edges[0]), (hand, head, edges[1])):
+        ids, weights = _dips(mesh, other, pairs)
+        if len(ids):
+            points = np.einsum("pc,pci->pi", weights, mesh.verts[ids])
+            deepest = max(deepest, float(other.closest(points, np.inf)[0].max()))
+    return deepest
+
+
 def find_contacts(
     head: DeformingMesh,
     hands: list[DeformingMesh],
@@ -181,8 +196,9 @@ def find_contacts(
     movable: np.ndarray,
     radius: float,
     near: float,
+    edges: tuple[np.ndarray, list[np.ndarray]] | None = None,
 ) -> Contacts:
-    """Contacts of all hands with the head, both ways: vertices of either against the faces of the other.
+    """Contacts of all hands with the head, both ways: vertices (and edges) of either against the faces of the other.
 
     The normal is the direction of the shortest way apart. Where that way would pull the skin outwards (a fingertip
     that came out on the far side, a vertex behind the finger) it is the head's smoothed outward normal instead.
@@ -193,60 +209,87 @@ def find_contacts(
         movable: head vertices that may be in a contact of the second kind, (A,).
         radius: how deep a contact is looked for [m].
         near: points outside by less than this are contacts too, so that they do not enter later [m].
+        edges: edges of the head (E, 2) and of each hand that are contacts where they dip into the other part between
+            two vertices that do not: in the middle of the stretch inside.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     for h, (hand, count) in enumerate(zip(hands, hand_counts, strict=True)):
-        points = hand.verts[:count]
-        distance, face, weight = head.signed(points, radius)
-        found = np.flatnonzero((face >= 0) & (distance < near))
-        if len(found):
-            depth = -distance[found]
-            inside, distance = depth > 0.0, np.abs(depth)
-            face, weight, p = face[found], weight[found], points[found]
-            q = surface_points(head.verts, head.faces, face, weight)
-            ids = head.faces[face]
-            away = _unit(np.einsum("pc,pci->pi", weight, outward[ids]))
-            normal = _direction(p, q, distance, inside, away)
-            wrong = (normal * away).sum(1) < 0.2
-            normal[wrong] = away[wrong]
-            one = np.tile([1.0, 0.0, 0.0], (len(found), 1))
-            parts.append((p, normal, ids, weight, np.full(len(found), h), depth, np.repeat(found[:, None], 3, 1), one))
+        anchor, share = _samples(hand, np.arange(count), None if edges is None else edges[1][h], head)
+        ours = _of_hand(head, hand, anchor, share, outward, radius, near)
         low, high = hand.box()
-        x = head.verts[movable]
-        boxed = movable[in_box(x, low - near, high + near)]
-        if not len(boxed):
-            continue
-        x = head.verts[boxed]
-        distance, face, weight = hand.signed(x, radius)
-        found = np.flatnonzero((face >= 0) & (distance < near))
-        if not len(found):
-            continue
-        depth = -distance[found]
-        inside, distance = depth > 0.0, np.abs(depth)
-        v, x, face, weight = boxed[found], x[found], face[found], weight[found]
-        q = surface_points(hand.verts, hand.faces, face, weight)
-        # From hand to head is the direction out of the hand; the contact's normal is its opposite.
-        normal = -_direction(x, q, distance, inside, -outward[v])
-        wrong = (normal * outward[v]).sum(1) < -0.2
-        normal[wrong] = outward[v[wrong]]
-        through = np.flatnonzero(wrong & inside)
-        if len(through):
-            paths = x[through, None] - _MARCH[:, None] * outward[v[through], None]
-            blocked = hand.inside(paths.reshape(-1, 3)).reshape(len(through), -1)
-            first = np.where(blocked.all(axis=1), len(_MARCH) - 1, np.argmin(blocked, axis=1))
-            q[through] = paths[np.arange(len(through)), first]
-        keep = ~wrong | inside
-        one = np.tile([1.0, 0.0, 0.0], (int(keep.sum()), 1))
-        ids = np.repeat(v[keep][:, None], 3, axis=1)
-        # Head vertices use one weight; the other two entries name the same vertex with weight 0.
-        parts.append(
-            (q[keep], normal[keep], ids, one, np.full(len(ids), h), depth[keep], hand.faces[face[keep]], weight[keep])
-        )
-    if not parts:
-        none = np.zeros((0, 3))
-        no_ids = np.zeros((0, 3), np.int64)
-        return Contacts(none, none, no_ids, none, np.zeros(0, np.int64), np.zeros(0), no_ids, none)
+        boxed = movable[in_box(head.verts[movable], low - near, high + near)]
+        ids, weights = _samples(head, boxed, None if edges is None else edges[0], hand)
+        theirs = _of_head(head, hand, ids, weights, outward, radius, near)
+        parts += [(*part[:4], np.full(len(part[0]), h), *part[4:]) for part in (ours, theirs)]
     return Contacts(*(np.ascontiguousarray(np.concatenate(column)) for column in zip(*parts, strict=True)))
+
+
+def _samples(
+    mesh: DeformingMesh, vertices: np.ndarray, edges: np.ndarray | None, other: DeformingMesh
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a mesh that may touch: vertex ids (P, 3) and weights (P, 3). A vertex is named three times."""
+    ids, weights = np.repeat(vertices[:, None], 3, axis=1), np.zeros((len(vertices), 3))
+    weights[:, 0] = 1.0
+    if edges is not None:
+        more, shares = _dips(mesh, other, edges)
+        ids, weights = np.concatenate((ids, more)), np.concatenate((weights, shares))
+    return ids, weights
+
+
+def _dips(mesh: DeformingMesh, other: DeformingMesh, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a mesh's edges inside another between outer ends, as vertex ids (P, 3) and weights (P, 3)."""
+    way = other.dips(mesh.verts, edges)
+    found = np.flatnonzero(np.isfinite(way))
+    way = way[found]
+    return edges[found][:, [0, 1, 1]], np.stack((1.0 - way, way, np.zeros(len(way))), axis=1)
+
+
+def _of_hand(
+    head: DeformingMesh, hand: DeformingMesh, anchor: np.ndarray, share: np.ndarray, outward: np.ndarray,
+    radius: float, near: float,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """Contacts of points of the hand with faces of the head, as in `Contacts` but without `hand`."""
+    points = np.einsum("pc,pci->pi", share, hand.verts[anchor])
+    distance, face, weight = head.signed(points, radius)
+    found = np.flatnonzero((face >= 0) & (distance < near))
+    depth = -distance[found]
+    inside, distance = depth > 0.0, np.abs(depth)
+    face, weight, p = face[found], weight[found], points[found]
+    q = surface_points(head.verts, head.faces, face, weight)
+    ids = head.faces[face]
+    away = _unit(np.einsum("pc,pci->pi", weight, outward[ids]))
+    normal = _direction(p, q, distance, inside, away)
+    wrong = (normal * away).sum(1) < 0.2
+    normal[wrong] = away[wrong]
+    return p, normal, ids, weight, depth, anchor[found], share[found]
+
+
+def _of_head(
+    head: DeformingMesh, hand: DeformingMesh, ids: np.ndarray, weights: np.ndarray, outward: np.ndarray,
+    radius: float, near: float,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """Contacts of points of the head with faces of the hand, as in `Contacts` but without `hand`."""
+    points = np.einsum("pc,pci->pi", weights, head.verts[ids])
+    distance, face, weight = hand.signed(points, radius)
+    found = np.flatnonzero((face >= 0) & (distance < near))
+    depth = -distance[found]
+    inside, distance = depth > 0.0, np.abs(depth)
+    ids, weights, x = ids[found], weights[found], points[found]
+    face, weight = face[found], weight[found]
+    away = _unit(np.einsum("pc,pci->pi", weights, outward[ids]))
+    q = surface_points(hand.verts, hand.faces, face, weight)
+    # From hand to head is the direction out of the hand; the contact's normal is its opposite.
+    normal = -_direction(x, q, distance, inside, -away)
+    wrong = (normal * away).sum(1) < -0.2
+    normal[wrong] = away[wrong]
+    through = np.flatnonzero(wrong & inside)
+    if len(through):
+        paths = x[through, None] - _MARCH[:, None] * away[through, None]
+        blocked = hand.inside(paths.reshape(-1, 3)).reshape(len(through), -1)
+        first = np.where(blocked.all(axis=1), len(_MARCH) - 1, np.argmin(blocked, axis=1))
+        q[through] = paths[np.arange(len(through)), first]
+    keep = ~wrong | inside
+    return q[keep], normal[keep], ids[keep], weights[keep], depth[keep], hand.faces[face[keep]], weight[keep]
 
 
 def _direction(

@@ -18,7 +18,7 @@ import scipy.sparse.csgraph
 from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.mesh.drawing import vertex_normals
 from nbavatar.mesh.topology import edges
-from nbavatar.physics.collision import Contacts, estimate_overlap, find_contacts, measure_overlap
+from nbavatar.physics.collision import Contacts, deepest_edge, estimate_overlap, find_contacts, measure_overlap
 from nbavatar.physics.rigid import rigid_motion, rotation_matrix
 from nbavatar.physics.tissue import SoftSurface
 from nbavatar.physics.xpbd import relax
@@ -60,7 +60,7 @@ class FrameResult(NamedTuple):
         pose: correction of each hand, translation [m] and rotation vector [rad] about the hand's centroid, (H, 6).
         head_contact: head vertices nearer to a hand than the touch distance, or corners of a face that is, (V,) bool;
             `hand_contact` likewise.
-        depth: greatest depth before and after [m]. steps: steps taken.
+        depth: greatest depth of vertices, and of edges between outer vertices, before and after [m]. steps: steps taken.
         exceeded: the depth left is over the tolerance, or a bound (dent, hand correction) was reached.
         active: number of simulated head vertices; 0 where nothing was to be done and the input is returned as it was.
     """
@@ -185,6 +185,8 @@ class ContactSolver:
             deepest = max(deepest, overlap.deepest)
             head_contact |= overlap.head_distance < n.touch
             hand_contact.append(overlap.hand_distance < n.touch)
+            if deepest <= n.tolerance:
+                deepest = max(deepest, deepest_edge(self._head, mesh, self._edges_with(k)))
         if deepest > n.tolerance:
             return deepest, None
         if head_contact.any() or any(touching.any() for touching in hand_contact):
@@ -237,15 +239,17 @@ class ContactSolver:
         return out
 
     def _contacts(
-        self, x: np.ndarray, hands: list[np.ndarray], outward: np.ndarray, active: np.ndarray, near: float | None = None
-    ) -> Contacts:
+        self, x: np.ndarray, hands: list[np.ndarray], outward: np.ndarray, active: np.ndarray,
+        near: float | None = None, pairs: np.ndarray | None = None,
+    ) -> Contacts:  # fmt: skip
         n = self.numbers
         self._head.move(x)
         for mesh, hand in zip(self._hands, hands, strict=True):
             mesh.move(hand)
         movable = active if len(active) else np.arange(self._count)
         near = 0.5 * n.step if near is None else near
-        return find_contacts(self._head, self._hands, self._hand_counts, outward, movable, 2.0 * n.step, near)
+        edges = None if pairs is None else (pairs, self._hand_edges)
+        return find_contacts(self._head, self._hands, self._hand_counts, outward, movable, 2.0 * n.step, near, edges)
 
     def _edges_with(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         return self.surface.edges, self._hand_edges[k]
@@ -306,8 +310,10 @@ class ContactSolver:
         moving = np.where(self._inverse_mass > 0, moving, 0.0)
         none, no_faces = np.zeros((0, 2), np.int64), np.zeros((0, 3), np.int64)
         held, still = np.zeros((len(hands), 6)), np.zeros((len(hands), 2))
+        a, b = s.edges.T
+        pairs = s.edges[(moving[a] + moving[b]) > 0]
         for turn in range(n.repair):
-            contacts = self._contacts(x, hands, outward, active, near=2e-4)
+            contacts = self._contacts(x, hands, outward, active, near=2e-4, pairs=pairs)
             if contacts.depth.max(initial=0.0) <= 0.5 * n.tolerance:
                 break
             table = np.concatenate((contacts.points, contacts.points, contacts.normals), axis=1)
@@ -327,10 +333,10 @@ class ContactSolver:
         n = self.numbers
         self._head.move(x)
         deepest, head_contact, hand_contact = 0.0, np.zeros(self._count, bool), []
-        for mesh, hand, count in zip(self._hands, hands, self._hand_counts, strict=True):
+        for k, (mesh, hand, count) in enumerate(zip(self._hands, hands, self._hand_counts, strict=True)):
             mesh.move(hand)
             overlap = measure_overlap(self._head, mesh, (self._count, count), n.touch)
-            deepest = max(deepest, overlap.deepest)
+            deepest = max(deepest, overlap.deepest, deepest_edge(self._head, mesh, self._edges_with(k)))
             head_contact |= overlap.head_distance < n.touch
             hand_contact.append(overlap.hand_distance < n.touch)
         self._label(x, hands, outward, head_contact, hand_contact)

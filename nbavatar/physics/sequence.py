@@ -19,7 +19,7 @@ class FrameRecord:
         head: float32 (V, 3) [m]; `hands` float32, (Vh, 3) each: the input's own bits where nothing was done.
         head_contact, hand_contact: bool, nearer than the touch distance.
         pose: float64 (H, 6), correction of each hand, translation [m] and rotation vector [rad] about its centroid.
-        depth: deepest vertex before and after [m].
+        depth: deepest vertex or edge before and after [m].
         steps, active: steps taken and vertices simulated; 0 in free frames.
         exceeded: the depth left is over twice the tolerance, or a bound was reached.
         finite: False where the input holds NaN or infinity; it is passed on untouched.

@@ -28,16 +28,16 @@ def _solver(modulus: float = 1e4, pinned: np.ndarray | None = None, **numbers) -
     return ContactSolver(_surface(modulus), HEAD, [(HAND, HAND_FACES)], chosen, pinned)
 
 
+def _depth_of(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> float:
+    """Deepest of points inside a mesh, by libigl [m]."""
+    closed = DeformingMesh(verts, faces)
+    inside = igl.winding_number(closed.verts, closed.closed_faces, points) > 0.5
+    return float(np.sqrt(igl.point_mesh_squared_distance(points[inside], verts, faces)[0].max())) if inside.any() else 0
+
+
 def _depth(head: np.ndarray, hand: np.ndarray) -> float:
-    """Deepest vertex of either part inside the other, by libigl [m]."""
-    deepest = 0.0
-    for points, verts, faces in ((hand, head, FACES), (head, hand, HAND_FACES)):
-        closed = DeformingMesh(verts, faces)
-        inside = igl.winding_number(closed.verts, closed.closed_faces, points) > 0.5
-        if inside.any():
-            squared = igl.point_mesh_squared_distance(points[inside], verts, faces)[0]
-            deepest = max(deepest, float(np.sqrt(squared.max())))
-    return deepest
+    """Deepest vertex of either part inside the other [m]."""
+    return max(_depth_of(hand, head, FACES), _depth_of(head, hand, HAND_FACES))
 
 
 @pytest.mark.parametrize("depth", [0.001, 0.005, 0.012, 0.02])
@@ -49,6 +49,34 @@ def test_nothing_is_left_inside_anything(depth):
     assert not result.exceeded or depth > 0.01
     volume = DeformingMesh(HEAD, FACES)
     assert abs(enclosed_volume(volume, result.head) / enclosed_volume(volume, HEAD) - 1) < 5e-3
+
+
+def _deepest_of_surfaces(head: np.ndarray, hand: np.ndarray) -> float:
+    """Like `_depth`, of 28 points on every face instead of the vertices."""
+    share = np.array([(i, j, 6 - i - j) for i in range(7) for j in range(7 - i)]) / 6.0
+    deepest = 0.0
+    for verts, faces, other, other_faces in ((hand, HAND_FACES, head, FACES), (head, FACES, hand, HAND_FACES)):
+        corners = verts[faces]
+        near = (corners.max(1) > other.min(0)).all(1) & (corners.min(1) < other.max(0)).all(1)
+        points = np.einsum("sc,fci->fsi", share, corners[near]).reshape(-1, 3)
+        deepest = max(deepest, _depth_of(points, other, other_faces))
+    return deepest
+
+
+@pytest.mark.parametrize("depth", [0.003, 0.008, 0.014])
+def test_faces_do_not_cut_through_each_other_between_their_vertices(depth):
+    result = _solver().solve(HEAD, [press(HAND, depth)])
+    assert _deepest_of_surfaces(result.head, result.hands[0]) < 2e-4
+
+
+def test_an_edge_that_dips_in_between_two_outer_vertices_is_contact():
+    """A needle laid flat into the cheek: all its vertices are outside, its long edges are 1 mm inside."""
+    needle = np.array([[-0.09, 0.0, 0], [0.09, 0.0, 0], [0.0, 0.0, 0.006], [0.0, 0.003, 0.006], [0.0, -0.003, 0.006]])
+    faces = np.array([[0, 2, 4], [0, 3, 2], [1, 4, 2], [1, 2, 3], [0, 4, 1], [0, 1, 3]])
+    placed = press(needle[:, [1, 0, 2]], 0.001)
+    assert _depth_of(placed, HEAD, FACES) == 0
+    result = ContactSolver(_surface(), HEAD, [(needle, faces)], ContactNumbers()).solve(HEAD, [placed])
+    assert result.depth[0] > 5e-4 and result.depth[1] < 2e-4 and result.active > 0
 
 
 def test_the_dent_is_where_the_hand_is_and_fades_out():
