@@ -24,13 +24,13 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from nbavatar.cli.common import read_mapping
+from nbavatar.cli.common import progress, read_mapping
 from nbavatar.cli.evaluate import read_protocol
 from nbavatar.config.core import to_mapping
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.config.tradeoff import TradeoffConfig, read_sheet
 from nbavatar.devices import device_name, lease_device
-from nbavatar.errors import DataError
+from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import write_json
 from nbavatar.provenance import code_digest, file_digest, run_record
@@ -42,9 +42,9 @@ _CHOOSERS = 4096  # most views kept in mind when contributions are asked for
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options of `nbavatar tradeoff`."""
-    parser.add_argument("--model", required=True, nargs="+", metavar="PT", help="trained avatar, then others")
+    parser.add_argument("--model", nargs="+", default=[], metavar="PT", help="trained avatar, then others")
     parser.add_argument("--meshes", required=True, metavar="NPZ", help="mesh sequence")
-    parser.add_argument("--frames", required=True, nargs="+", metavar="ZIP", help="held-out frame packs")
+    parser.add_argument("--frames", nargs="+", default=[], metavar="ZIP", help="held-out frame packs")
     parser.add_argument("--train-frames", nargs="*", default=[], metavar="ZIP", help="packs of the training cameras")
     parser.add_argument("--protocol", default="nv1024", metavar="JSON|FILE|NAME", help="which held-out images")
     parser.add_argument("--sheet", default="{}", metavar="JSON|FILE", help="knobs and values (TradeoffConfig)")
@@ -53,11 +53,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-minutes", type=float, metavar="MIN", help="stop after this time; a later call goes on")
     parser.add_argument("--no-store", action="store_true", help="do not put presets.json beside the model")
     parser.add_argument("--savings", action="store_true", help="measure the savings, each on and off")
+    parser.add_argument("--offline", action="store_true", help="measure the stages before training; needs --meshes only")
 
 
 def main(args: argparse.Namespace) -> int:
     """Runs `nbavatar tradeoff`."""
     sheet = read_sheet(read_mapping(args.sheet, "--sheet"), "--sheet")
+    if args.offline:
+        return _offline(args, sheet)
+    for name in ("model", "frames"):
+        if not getattr(args, name):
+            raise ConfigError.of(f"--{name}", expected="one file or more", found="none")
     protocol = read_protocol(args.protocol, "nv")
     with lease_device(args.device) as device, ExitStack() as stack:
         packs = [stack.enter_context(FramePack(path)) for path in args.frames]
@@ -70,6 +76,32 @@ def timed_device(device: str) -> str:
     import torch
 
     return device_name(device) + ("" if device == "cuda" else f", {torch.get_num_threads()} threads")
+
+
+def _offline(args: argparse.Namespace, sheet: TradeoffConfig) -> int:
+    from itertools import chain
+
+    from nbavatar.data.sequences import read_sequence
+    from nbavatar.io.atomic import atomic_write
+    from nbavatar.reporting.figures import save_figure
+    from nbavatar.tradeoff.figures import offline_figure
+    from nbavatar.tradeoff.offline import contact_rows, decimation_rows, refit_rows, spectral_rows
+    from nbavatar.tradeoff.tables import offline_markdown, rows_csv
+
+    out = Path(args.out)
+    sequence, _ = read_sequence(args.meshes)
+    o = sheet.offline
+    stages = chain(contact_rows(sequence, o), refit_rows(o), spectral_rows(sequence, o), decimation_rows(sequence, o))
+    rows = list(progress(stages, "offline stages"))
+    _write(out / "offline.csv", rows_csv(rows))
+    _write(out / "offline.md", offline_markdown(rows))
+    for suffix in ("png", "pdf"):
+        with atomic_write(out / f"offline.{suffix}") as path:
+            save_figure(offline_figure(rows), path)
+    record = run_record("tradeoff", config=to_mapping(o), inputs={"meshes": args.meshes}, device=timed_device("cpu"))
+    write_json(out / "offline.json", {"kind": "offline", "format": 1, "rows": rows, "record": record})
+    print(f"{out}/offline.md: {len(rows)} rows")
+    return 0
 
 
 def _sweep(

@@ -11,7 +11,7 @@ from typing import Any
 from nbavatar.config.core import from_mapping, merge, option, to_mapping
 from nbavatar.errors import ConfigError, did_you_mean
 
-__all__ = ["ACCURATE", "LimitConfig", "SettingConfig", "TradeoffConfig", "read_sheet", "vary"]
+__all__ = ["ACCURATE", "LimitConfig", "OfflineConfig", "SettingConfig", "TradeoffConfig", "read_sheet", "vary"]
 
 ACCURATE = "accurate"
 
@@ -47,6 +47,22 @@ class LimitConfig:
 
 
 @dataclass(frozen=True)
+class OfflineConfig:
+    """Knobs of the stages before training."""
+
+    contact_frames: int = option(6, "Frames of deepest contact that are solved.", min=1)
+    contact_iterations: list[int] = option([1, 2, 4, 8, 16, 32], "Sweeps over all constraints in a step.", min=1)
+    contact_settle: list[int] = option([0, 2, 4, 8], "Steps after the hand has arrived.", min=0)
+    refit_frames: int = option(30, "Frames of the synthetic subject that is refitted.", min=4)
+    refit_mesh: str = option("full", "Size of its models.", choices=("full", "tiny"))
+    refit_cameras: list[int] = option([2, 3, 4, 6, 8], "Cameras of the refit.", min=2, max=64)
+    refit_iterations: list[int] = option([5, 10, 20, 40, 60], "Iterations of the refit.", min=0)
+    spectral_modes: list[int] = option([3, 6, 12, 24, 48], "Modes a part.", min=1, max=512)
+    decimate_shares: list[float] = option([0.75, 0.5, 0.25, 0.1], "Shares of the faces kept.", min=0.01, max=1.0)
+    decimate_frames: int = option(6, "Frames on which the original is compared.", min=1)
+
+
+@dataclass(frozen=True)
 class TradeoffConfig:
     """One sheet: the exact setting, the knobs and their values, what presets may lose, how much is measured."""
 
@@ -66,6 +82,7 @@ class TradeoffConfig:
     warmup: int = option(1, "Pictures before timing starts.", min=0)
     net: str = option("alex", "Backbone of LPIPS.", choices=("alex", "vgg"))
     importance_views: int = option(8, "Views that decide which billboards contribute.", min=1)
+    offline: OfflineConfig = option(OfflineConfig, "The stages before training (`--offline`).")
 
 
 _FIELDS = {field.name: field for field in fields(SettingConfig)}

@@ -1,7 +1,7 @@
 """Fronts of speed, memory and size against quality, for print (matplotlib, imported where a figure is drawn)."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nbavatar.reporting.curves import PALETTE
 from nbavatar.tradeoff.front import Point, pareto_front
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COSTS", "front_figure"]
+__all__ = ["COSTS", "front_figure", "offline_figure"]
 
 # Cost -> axis label; each has a front against PSNR and one against LPIPS.
 COSTS = {
@@ -73,6 +73,38 @@ def front_figure(points: Sequence[Point], presets: Mapping[str, Point], cost: st
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(labels)), frameon=False, fontsize=9)
     figure.suptitle(caption, fontsize=10)
+    return figure
+
+
+def offline_figure(rows: Sequence[Mapping[str, Any]]) -> "Figure":
+    """Error over time of the stages before training: one panel a stage and knob, every point named by its value.
+
+    Args:
+        rows: of `nbavatar.tradeoff.offline`.
+    """
+    from matplotlib.figure import Figure
+
+    groups = list(dict.fromkeys((row["stage"], row["knob"]) for row in rows))
+    figure = Figure(figsize=(3.6 * min(3, len(groups)), 3.1 * -(-len(groups) // 3)), layout="constrained")
+    axes = figure.subplots(-(-len(groups) // 3), min(3, len(groups)), squeeze=False).ravel()
+    for axis in axes[len(groups) :]:
+        axis.axis("off")
+    for number, (axis, (stage, knob)) in enumerate(zip(axes, groups, strict=False)):
+        own = [row for row in rows if (row["stage"], row["knob"]) == (stage, knob)]
+        # The coarseness of a mesh costs billboards later, not time now.
+        cost, label = ("faces", "faces left [1]") if stage == "decimate" else ("ms", "time [ms]")
+        xs, ys = [row[cost] for row in own], [row["error_mm"] for row in own]
+        axis.plot(xs, ys, "o-", color=PALETTE[number % len(PALETTE)], lw=1.0, ms=4)
+        for row, x, y in zip(own, xs, ys, strict=True):
+            axis.annotate(f"{row['value']:g}", (x, y), xytext=(3, 4), textcoords="offset points", fontsize=8)
+        if min(ys) > 0 and max(ys) > 10 * min(ys):
+            axis.set_yscale("log")
+        axis.set_title(f"{stage}: {knob}", fontsize=10)
+        axis.set_xlabel(label, fontsize=9)
+        axis.set_ylabel("error [mm]", fontsize=9)
+        axis.grid(linewidth=0.4, alpha=0.5)
+        axis.margins(0.15)
+        axis.spines[["top", "right"]].set_visible(False)
     return figure
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from nbavatar.tradeoff.front import Point, losses, pareto_front
 from nbavatar.tradeoff.measure import STAGES
 
-__all__ = ["point_rows", "points_csv", "points_markdown", "rows_csv"]
+__all__ = ["offline_markdown", "point_rows", "points_csv", "points_markdown", "rows_csv"]
 
 
 def point_rows(points: Sequence[Point], presets: Mapping[str, Point], device: str) -> list[dict[str, Any]]:
@@ -97,5 +97,19 @@ def points_markdown(points: Sequence[Point], presets: Mapping[str, Point]) -> st
             f"{v['peak_memory_mb']:.0f}",
             f"{v['model_mb']:.2f}",
         ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def offline_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows of `nbavatar.tradeoff.offline` as a table to read."""
+    head = ["stage", "knob", "value", "time [ms]", "error [mm]", "worst [mm]", "depth left [mm]", "from the dataset [mm]",
+            "faces", "what the error is"]  # fmt: skip
+    lines = ["| " + " | ".join(head) + " |", "|---|---|" + "---:|" * (len(head) - 3) + "---|"]
+    for row in rows:
+        numbers = [("ms", ".1f"), ("error_mm", ".3f"), ("worst_mm", ".2f"), ("depth_mm", ".3f"), ("reference_mm", ".3f")]
+        cells = [row["stage"], row["knob"], f"{row['value']:g}"]
+        cells += ["" if row[key] is None else format(row[key], form) for key, form in numbers]
+        cells += ["" if row["faces"] is None else str(row["faces"]), row["meaning"]]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
