@@ -27,6 +27,8 @@ if RUN.layout == "decaf":
             "logs/{run}/fit/{subject}.log",
         benchmark:
             "benchmarks/{run}/fit/{subject}.jsonl"
+        # Trainings wait for this chain; crops are many and can be made beside it.
+        priority: 10
         threads: 4
         resources:
             mem="16GB",
@@ -52,6 +54,7 @@ rule spectral:
         ),
     log:
         "logs/{run}/spectral/{subject}.log",
+    priority: 10
     resources:
         mem="4GB",
         runtime="30m",
@@ -78,6 +81,7 @@ rule deform:
         "logs/{run}/deform/{subject}.log",
     benchmark:
         "benchmarks/{run}/deform/{subject}.jsonl"
+    priority: 10
     threads: 4
     resources:
         mem="8GB",
