@@ -20,7 +20,8 @@ class Triangulation(NamedTuple):
     """Points from views.
 
     Attributes:
-        points: float64 `[..., 3]` [m], world; NaN where fewer than two views agree.
+        points: float64 `[..., 3]` [m], world; NaN where fewer than two views agree, or where their rays are so nearly
+            one line that a pixel would move the point by more than its distance.
         inliers: bool `[M, ...]`, the views that agree with the point.
         error: float64 `[...]` [px], root mean square reprojection error over the inliers; NaN without a point.
     """
@@ -51,7 +52,9 @@ def triangulate(
     """
     cameras, shape = len(K), pixels.shape[1:-1]
     flat = np.asarray(pixels, np.float64).reshape(cameras, -1, 2)
-    weight = np.where(np.isfinite(flat).all(-1), np.asarray(confidence, np.float64).reshape(cameras, -1), 0.0)
+    weight = np.asarray(confidence, np.float64).reshape(cameras, -1)
+    # A comparison with NaN is false: what is not a positive number, in pixels or confidence, is no detection.
+    weight = np.where(np.isfinite(flat).all(-1) & (weight > 0) & np.isfinite(weight), weight, 0.0)
     flat = np.where(weight[..., None] > 0, flat, 0.0)
     project = np.asarray(K, np.float64) @ np.asarray(cam_from_world, np.float64)[:, :3]
     points = np.full((flat.shape[1], 3), np.nan)
@@ -91,10 +94,19 @@ def _solve(
     inliers = found & (weight > 0) & (squared < threshold**2)
     views = inliers.sum(0)
     kept = found & (views >= 2)
+    kept[kept] = _determined(point[kept], inliers[:, kept], project)
     inliers &= kept
     with np.errstate(invalid="ignore", divide="ignore"):
         error = np.sqrt(np.where(inliers, squared, 0).sum(0) / views)
     return np.where(kept[:, None], point, np.nan), inliers, np.where(kept, error, np.nan)
+
+
+def _determined(points: np.ndarray, inliers: np.ndarray, project: np.ndarray) -> np.ndarray:
+    """Whether an error of one pixel moves each point by less than its distance from the nearest of its views."""
+    jacobian, depth = _jacobian(points, inliers, project)
+    normal = np.einsum("mn,mnki,mnkj->nij", inliers.astype(np.float64), jacobian, jacobian)
+    weakest = np.linalg.eigvalsh(normal)[:, 0]
+    return weakest * np.where(inliers, depth, np.inf).min(0, initial=np.inf) ** 2 > 1.0
 
 
 def _linear(pixels: np.ndarray, project: np.ndarray) -> np.ndarray:
@@ -131,13 +143,18 @@ def _refine(
     points: np.ndarray, pixels: np.ndarray, weight: np.ndarray, project: np.ndarray, scale: float
 ) -> np.ndarray:
     """One Gauss-Newton step with Geman-McClure weights of width `scale` [px]."""
-    image = _project(points, project)
-    depth = np.where(weight > 0, image[..., 2], 1.0)
-    xy = image[..., :2] / depth[..., None]
-    residual = xy - pixels
+    jacobian, depth = _jacobian(points, weight > 0, project)
+    residual = _project(points, project)[..., :2] / depth[..., None] - pixels
     robust = weight / (1 + (residual**2).sum(-1) / scale**2) ** 2
-    jacobian = (project[:, None, :2, :3] - xy[..., None] * project[:, None, 2:, :3]) / depth[..., None, None]
     normal = np.einsum("mn,mnki,mnkj->nij", robust, jacobian, jacobian)
     right = np.einsum("mn,mnki,mnk->ni", robust, jacobian, residual)
     ridge = 1e-12 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300
     return points - np.linalg.solve(normal + ridge * np.eye(3), right[..., None])[..., 0]
+
+
+def _jacobian(points: np.ndarray, seen: np.ndarray, project: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivative of the pixels by the points, `[M, n, 2, 3]` [px/m], and depths `[M, n]` [m], 1 where not seen."""
+    image = _project(points, project)
+    depth = np.where(seen, image[..., 2], 1.0)
+    xy = image[..., :2] / depth[..., None]
+    return (project[:, None, :2, :3] - xy[..., None] * project[:, None, 2:, :3]) / depth[..., None, None], depth
