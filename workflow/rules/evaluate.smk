@@ -55,7 +55,8 @@ rule evaluate:
         " --cfg {params.cfg:q} > {log} 2>&1"
 
 
-# Timing wants the machine for itself: it takes every core, so no other job of this workflow runs beside it.
+# Timing wants the machine for itself: it takes every core, so no other job of this workflow runs beside it. (On a cluster,
+# where no number of cores is given, it gets what other GPU jobs get.)
 rule speed:
     input:
         model="results/{run}/train/{subject}/{variant}/model.pt",
@@ -65,7 +66,7 @@ rule speed:
         "results/{run}/speed/{subject}/{variant}.json",
     log:
         "logs/{run}/speed/{subject}/{variant}.log",
-    threads: workflow.cores or 4
+    threads: workflow.resource_settings.cores or 4
     resources:
         gpu=1,
         mem="16GB",
