@@ -4,6 +4,7 @@ Deterministic: the same inputs give the same bytes, forward and backward, whatev
 threads.
 """
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -29,11 +30,17 @@ def blend_cpu(
 ) -> tuple[Tensor, Tensor]:
     """Blends projected Gaussians front to back; arguments and results as `blend_reference`.
 
-    Works in the dtype of `opacities` and `colours`, float32 or float64, and returns it.
+    Works in the dtype of `opacities` and `colours`, float32 or float64, and returns it. Tensors on
+    another device are copied to the CPU, and the results back.
 
     Raises:
         DeviceError: the memory needed is not there.
     """
+    device = opacities.device
+    if device.type != "cpu":
+        host = Projection(*(getattr(projection, field.name).cpu() for field in fields(projection)))
+        image, alpha = blend_cpu(host, rank.cpu(), opacities.cpu(), colours.cpu(), settings)
+        return image.to(device), alpha.to(device)
     return _Blend.apply(projection.form, opacities.contiguous(), colours.contiguous(), projection, rank, settings)
 
 

@@ -1,6 +1,6 @@
 """Public function of the Gaussian rasterizer: argument checks, projection, choice of the backend."""
 
-from collections.abc import Callable
+import importlib.util
 from typing import NamedTuple
 
 import torch
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nbavatar.errors import DataError, DeviceError
 from nbavatar.raster.ordering import canonical_rank
-from nbavatar.splat.projection import Projection, camera_centre, project_gaussians
+from nbavatar.splat.projection import camera_centre, project_gaussians
 from nbavatar.splat.reference import SplatSettings, blend_reference
 from nbavatar.splat.spherical_harmonics import DEGREES, harmonic_colours, harmonic_count
 
@@ -17,7 +17,6 @@ __all__ = ["SplatImage", "render_gaussians"]
 _WHERE = "render_gaussians"
 _BACKENDS = ("auto", "reference", "cpu", "gsplat")
 _LARGEST = 1e30  # of scales, whose fourth powers must stay finite
-_Blend = Callable[[Projection, Tensor, Tensor, Tensor, SplatSettings], tuple[Tensor, Tensor]]
 
 
 class SplatImage(NamedTuple):
@@ -89,8 +88,10 @@ def render_gaussians(
         alpha_min: a smaller alpha is skipped.
         alpha_max: alpha is capped here; where it is, it passes no gradient on.
         t_min: a pixel is finished before its transmittance falls under this.
-        backend: `auto` takes the kernels for the tensors' device: the CPU's, and `gsplat` on a GPU
-            where that package is installed; `reference` is the slow oracle, on any device.
+        backend: `cpu` blends with our kernels, on the CPU (tensors on a GPU are projected there and
+            copied for it); `gsplat` takes that package, on a GPU, with the restrictions that
+            `nbavatar.splat.gsplat_backend` names; `auto` is `gsplat` for tensors on a GPU where it is
+            installed, else `cpu`; `reference` is the slow oracle, on any device.
 
     Returns:
         A SplatImage in the widest dtype of the first five tensors, at least float32. Gradients reach
@@ -108,31 +109,41 @@ def render_gaussians(
     for tensor in (means, quats, scales, opacities, colours):
         dtype = torch.promote_types(dtype, tensor.dtype)
     settings = SplatSettings(width, height, alpha_min, alpha_max, t_min)
-    blend = _backend(backend, means.device)
+    backend = _resolve(backend, means.device)
     rgb = colours
     if degree is not None:
         offsets = means.double() - camera_centre(viewmat.detach().double())
         rgb = harmonic_colours(colours.to(dtype), offsets.to(dtype), degree)
+    if backend == "gsplat":
+        from nbavatar.splat.gsplat_backend import render_gsplat
+
+        rendered = render_gsplat(
+            means, quats, scales, opacities, rgb, viewmat, K, settings, near=near, low_pass=low_pass,
+            screen_offsets=screen_offsets,
+        )  # fmt: skip
+        return SplatImage(*(tensor.to(dtype) for tensor in rendered))
     projection = project_gaussians(
         means, quats, scales, viewmat, K, width, height, near=near, low_pass=low_pass, screen_offsets=screen_offsets
     )
     rank = canonical_rank(projection.depth, means, quats, scales, colours, opacities)
+    blend = blend_reference
+    if backend == "cpu":
+        from nbavatar.splat.cpu import blend_cpu as blend  # Numba is loaded only when it is needed
     image, alpha = blend(projection, rank, opacities.to(dtype), rgb.to(dtype), settings)
     return SplatImage(image.to(dtype), alpha.to(dtype), projection.radii.to(dtype))
 
 
-def _backend(name: str, device: torch.device) -> _Blend:
+def _resolve(name: str, device: torch.device) -> str:
+    """The backend that a name stands for on a device."""
     if name not in _BACKENDS:
         raise DataError.of(_WHERE, "backend", expected=f"one of {', '.join(_BACKENDS)}", found=repr(name))
     if name == "auto":
-        name = "cpu" if device.type == "cpu" else "reference"
-    if name == "reference":
-        return blend_reference
-    if name == "cpu" and device.type == "cpu":
-        from nbavatar.splat.cpu import blend_cpu  # Numba is loaded only when it is needed
-
-        return blend_cpu
-    raise DeviceError.of(_WHERE, "backend", expected=f"tensors on {name}", found=f"tensors on {device.type}")
+        on_gpu = device.type == "cuda" and importlib.util.find_spec("gsplat") is not None
+        return "gsplat" if on_gpu else "cpu"
+    if name == "gsplat" and device.type != "cuda":
+        raise DeviceError.of(_WHERE, "backend", expected="tensors on cuda for 'gsplat'",
+                             found=f"tensors on {device.type}")  # fmt: skip
+    return name
 
 
 def _degree(colours: Tensor, sh_degree: int | None) -> int | None:
@@ -184,11 +195,14 @@ def _check_tensors(
 
 def _check_values(named: dict[str, Tensor]) -> None:
     for name, value in named.items():
-        _refuse_rows(name, ~torch.isfinite(value.detach()), "finite values", "NaN or infinity")
+        # a sum is finite only if all are; it may also overflow, so it only settles the good case
+        if not bool(torch.isfinite(value.detach().sum())):
+            _refuse_rows(name, ~torch.isfinite(value.detach()), "finite values", "NaN or infinity")
     _refuse_rows("quats", (named["quats"].detach() == 0).all(-1), "no zero quaternion", "one")
     scales, opacities = named["scales"].detach(), named["opacities"].detach()
-    _refuse_rows("scales", (scales < 0) | (scales > _LARGEST), f"values in [0, {_LARGEST:g}]", "another")
-    _refuse_rows("opacities", (opacities < 0) | (opacities > 1), "values in [0, 1]", "another")
+    for name, value, largest in (("scales", scales, _LARGEST), ("opacities", opacities, 1.0)):
+        if value.numel() and not 0 <= float(value.min()) <= float(value.max()) <= largest:
+            _refuse_rows(name, (value < 0) | (value > largest), f"values in [0, {largest:g}]", "another")
     K = named["K"].detach()
     if bool((K[[1, 2, 2], [0, 0, 1]] != 0).any()) or float(K[2, 2]) != 1 or bool((K[[0, 1], [0, 1]] <= 0).any()):
         raise DataError.of(_WHERE, "K", expected="upper triangular, positive focal lengths, last row 0 0 1",

@@ -236,7 +236,7 @@ def test_bad_input_is_refused_in_one_line():
     view, K = camera(dtype=torch.float32)
     nan = torch.tensor(float("nan"))
 
-    def refuse(words, error=DataError, change=None, **options):
+    def refuse(words, error: type[Exception] = DataError, change=None, **options):
         arguments = dict(zip(NAMES, scene, strict=True)) | {"viewmat": view, "K": K, "width": 40, "height": 30}
         with pytest.raises(error, match=words) as caught:
             render_gaussians(**(arguments | (change or {}) | options))
