@@ -35,9 +35,9 @@ from nbavatar.reporting.page import (
     strips_section,
     tables_section,
 )
-from nbavatar.reporting.pictures import data_uri, reduce_picture
+from nbavatar.reporting.pictures import ERROR_MAX, data_uri, reduce_picture
 
-__all__ = ["add_arguments", "main"]
+__all__ = ["add_arguments", "main", "read_histories", "read_renders"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,14 +66,14 @@ def main(args: argparse.Namespace) -> int:
     evals = [(path, read_json(path)) for path in args.evals]
     speeds = [(path, read_json(path)) for path in args.speeds]
     with ExitStack() as stack:
-        renders = _renders([stack.enter_context(FramePack(path)) for path in args.renders], evals)
+        renders = read_renders([stack.enter_context(FramePack(path)) for path in args.renders], evals)
         crops = [stack.enter_context(FramePack(path)) for path in args.frames]
         comparisons = compare_frames(renders, crops, frames=cfg.frames)
     strips = {
         f"{subject}, protocol {protocol}": [to_strip(comparison, max_side=cfg.max_side) for comparison in group]
         for (subject, protocol), group in comparisons.items()
     }
-    histories = _histories(args.histories)
+    histories = read_histories(args.histories)
     if args.figures:
         _write_figures(Path(args.figures), comparisons, histories)
     sections = [
@@ -100,7 +100,8 @@ def _tables(paths: list[str]) -> dict[str, tuple[str, str]]:
     return {stem: (found.get(".md", ""), found.get(".csv", "")) for stem, found in texts.items()}
 
 
-def _renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[Rendered]:
+def read_renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[Rendered]:
+    """Renders with their figures per image, where an evaluation has them."""
     figures: dict[tuple[str, str, str], dict[str, Any]] = {}
     for _, content in evals:
         key = (content["subject"], content["variant"], content["protocol"]["name"])
@@ -120,30 +121,24 @@ def _renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[Rende
 def _write_figures(
     folder: Path, comparisons: dict[tuple[str, str], list[Comparison]], histories: dict[str, list[dict[str, Any]]]
 ) -> None:
-    from nbavatar.reporting.curves import training_curves
-    from nbavatar.reporting.figures import comparison_figure, curves_figure, save_figure
+    from nbavatar.reporting.figures import save_figure
+    from nbavatar.reporting.gallery import comparison_rows, curves_drawn
+    from nbavatar.reporting.grids import grid_figure
 
-    figures = {}
-    curves = training_curves(histories)
-    if curves:
-        figures["training"] = curves_figure(curves)
-
+    figures = {"training": curves_drawn(histories).figure} if histories else {}
     for (subject, protocol), group in comparisons.items():
         for number, comparison in enumerate(group):
-            rows = [row for row in ROWS if any(row in column.pictures for column in comparison.columns)]
-            figures[f"{subject}_{protocol}_{number}"] = comparison_figure(
-                [column.title for column in comparison.columns],
-                [[column.pictures.get(row) for column in comparison.columns] for row in rows],
-                rows,
-                error_row="error" in rows,
-            )
+            columns = [(column.title, column.title) for column in comparison.columns]
+            rows = comparison_rows(comparison, columns, ROWS)
+            bar = ("|error|, sRGB [1]", ERROR_MAX) if any(row.name == "error" for row in rows) else None
+            figures[f"{subject}_{protocol}_{number}"] = grid_figure([title for title, _ in columns], rows, bar=bar)
     for name, figure in figures.items():
         for suffix in ("png", "pdf"):
             with atomic_write(folder / f"{name}.{suffix}") as path:
                 save_figure(figure, path)
 
 
-def _histories(paths: list[str]) -> dict[str, list[dict[str, Any]]]:
+def read_histories(paths: list[str]) -> dict[str, list[dict[str, Any]]]:
     """Logged lines by avatar, named by the last two folders of the file."""
     histories: dict[str, list[dict[str, Any]]] = {}
     for name in paths:

@@ -58,6 +58,8 @@ def render_views(
     check_parts(avatar, sequence)
     background = torch.tensor(protocol.background, dtype=torch.float32, device=device)
     avatar.eval()
+    # Frames of a reenactment may bear the names of training frames, and are none.
+    refined = protocol.refined and "driver" not in sequence.extras
     for view in views:
         verts: Mapping[str, Tensor] = {
             part: torch.from_numpy(np.asarray(sequence.parts[part].verts[view.row], dtype=np.float32)).to(device)
@@ -71,7 +73,7 @@ def render_views(
                 view.width,
                 view.height,
                 background,
-                frame=view.frame if protocol.refined else None,
+                frame=view.frame if refined else None,
                 precision=protocol.precision,
                 roi=protocol.roi,
                 order=protocol.order,

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from nbavatar.io.framepack import FramePack
-from nbavatar.reporting.insets import contact_window, cut
+from nbavatar.reporting.insets import contact_pixels, contact_window, cut
 from nbavatar.reporting.page import Card, Strip
 from nbavatar.reporting.pictures import data_uri, error_map, reduce_picture, spread
 
-__all__ = ["ROWS", "Column", "Comparison", "Rendered", "compare_frames", "find_truth", "to_strip"]
+__all__ = ["ROWS", "Column", "Comparison", "Rendered", "compare_frame", "compare_frames", "find_truth"]
+__all__ += ["frames_in_contact", "to_strip"]
 
 ROWS = ("whole", "zoom", "coverage", "error")
 _WORDS = {
@@ -90,12 +91,38 @@ def compare_frames(
     for render in renders:
         groups.setdefault((render.subject, render.protocol), []).append(render)
     return {
-        key: [_compare(name, group, crops) for name in spread(group[0].pack.frames, frames)]
+        key: [compare_frame(name, group, crops) for name in spread(group[0].pack.frames, frames)]
         for key, group in groups.items()
     }
 
 
-def _compare(name: str, group: Sequence[Rendered], crops: Sequence[FramePack]) -> Comparison:
+def frames_in_contact(names: Sequence[str], pack: FramePack, crops: Sequence[FramePack], count: int) -> list[str]:
+    """The frames with the largest contact of hand and head, one from each of ``count`` equal stretches of the list.
+
+    At most 24 labels are looked at, evenly spread; without labels the middle of each stretch is taken.
+
+    Args:
+        names: ``<camera>/<frame>``, in order.
+        pack: a render of them.
+        crops: ground-truth crops; their layer ``label`` tells where hand meets head.
+        count: how many frames.
+    """
+    count = min(count, len(names))
+    looked = {}
+    for name in spread(names, max(24, count)):
+        crop = find_truth(pack, name, crops)
+        if crop is not None and "label" in crop.layers:
+            looked[name] = contact_pixels(crop.read("label", name.partition("/")[2]))
+    chosen = []
+    for i in range(count):
+        stretch = names[round(i * len(names) / count) : round((i + 1) * len(names) / count)]
+        best = max(stretch, key=lambda name: looked.get(name, 0))
+        chosen.append(best if looked.get(best, 0) > 0 else stretch[len(stretch) // 2])
+    return chosen
+
+
+def compare_frame(name: str, group: Sequence[Rendered], crops: Sequence[FramePack]) -> Comparison:
+    """One frame ``<camera>/<frame>``: the truth where there is one, then every method of the group that has it."""
     camera, _, frame = name.partition("/")
     truth, window = None, None
     columns = []

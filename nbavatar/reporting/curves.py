@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["PALETTE", "Curve", "line_chart", "thin", "training_curves"]
+__all__ = ["PALETTE", "Curve", "line_chart", "thin", "ticks", "training_curves", "widened"]
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision; dashes tell series apart beyond its length.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8A7F00")
@@ -104,8 +104,8 @@ def line_chart(title: str, series: Series, *, x_label: str, y_label: str, log_y:
         return ""
     xs = [x for points in drawn.values() for x, _ in points]
     ys = [y for points in drawn.values() for _, y in points]
-    x_range = _widened(min(xs), max(xs))
-    y_range = _widened(min(ys), max(ys))
+    x_range = widened(min(xs), max(xs))
+    y_range = widened(min(ys), max(ys))
     rows = math.ceil(len(drawn) / 3)
     height = _HEIGHT + 16 * rows
     bottom = _HEIGHT - _BOTTOM
@@ -122,11 +122,11 @@ def line_chart(title: str, series: Series, *, x_label: str, y_label: str, log_y:
         f"<title>{text}</title>",
         f'<text class="head" x="{_LEFT}" y="18">{text}</text>',
     ]
-    for tick, name in _ticks(*y_range, log_y):
+    for tick, name in ticks(*y_range, log_y):
         _, y = place(x_range[0], tick)
         parts.append(f'<path class="grid" d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}"/>')
         parts.append(f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{name}</text>')
-    for tick, name in _ticks(*x_range, False):
+    for tick, name in ticks(*x_range, False):
         x, _ = place(tick, y_range[0])
         parts.append(f'<path class="grid" d="M{x:.1f} {_TOP}V{bottom}"/>')
         parts.append(f'<text x="{x:.1f}" y="{bottom + 16}" text-anchor="middle">{name}</text>')
@@ -155,11 +155,12 @@ def _drawable(points: Sequence[tuple[float, float]], log_y: bool) -> list[tuple[
     return [(x, math.log10(y)) for x, y in good] if log_y else good
 
 
-def _widened(low: float, high: float) -> tuple[float, float]:
+def widened(low: float, high: float) -> tuple[float, float]:
+    """The range itself, or one around it if it has no extent."""
     return (low, high) if high > low else (low - 0.5, high + 0.5)
 
 
-def _ticks(low: float, high: float, log: bool) -> list[tuple[float, str]]:
+def ticks(low: float, high: float, log: bool) -> list[tuple[float, str]]:
     """Round positions inside a range and their labels; on a log axis the range and the positions are exponents."""
     if log:
         return _log_ticks(low, high)

@@ -1,5 +1,6 @@
 """Figures for print, PNG and PDF, by matplotlib (imported where a figure is drawn)."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -7,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nbavatar.reporting.curves import PALETTE, Curve
-from nbavatar.reporting.pictures import ERROR_MAX, RAMP
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["comparison_figure", "curves_figure", "save_figure", "sensitivity_figure"]
+__all__ = ["curves_figure", "save_figure", "sensitivity_figure"]
 
 _AXES = (
     ("psnr", "PSNR [dB]"),
@@ -54,10 +54,18 @@ def curves_figure(curves: Sequence[Curve]) -> "Figure":
     """Training curves: one panel a quantity, one line an avatar, a common legend."""
     from matplotlib.figure import Figure
 
+    # Places in inches, by hand: matplotlib's own layout measures every label several times, which takes seconds.
     across = min(3, len(curves))
     down = -(-len(curves) // across)
-    figure = Figure(figsize=(3.2 * across, 2.3 * down + 0.5), layout="constrained", dpi=200)
+    names = list(dict.fromkeys(name for curve in curves for name in curve.series))
+    foot = 0.2 * math.ceil(len(names) / 5) + 0.15
+    width, height = 3.3 * across, 2.4 * down + foot
+    figure = Figure(figsize=(width, height), dpi=150)
     axes = figure.subplots(down, across, squeeze=False).ravel()
+    figure.subplots_adjust(
+        left=0.75 / width, right=1 - 0.12 / width, top=1 - 0.3 / height, bottom=(foot + 0.5) / height,
+        wspace=0.85 / 2.45, hspace=0.85 / 1.55,
+    )  # fmt: skip
     for axis in axes[len(curves) :]:
         axis.axis("off")
     for axis, curve in zip(axes, curves, strict=False):
@@ -85,54 +93,9 @@ def curves_figure(curves: Sequence[Curve]) -> "Figure":
         axis.tick_params(which="both", labelsize=7)
         axis.grid(linewidth=0.4, alpha=0.6)
         axis.spines[["top", "right"]].set_visible(False)
-    handles, names = axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles, names, loc="outside lower center", ncols=min(5, max(1, len(names))), fontsize=7, frameon=False
-    )
-    return figure
-
-
-def comparison_figure(
-    columns: Sequence[str], rows: Sequence[Sequence[np.ndarray | None]], row_names: Sequence[str], *, error_row: bool
-) -> "Figure":
-    """A grid of pictures: one column a method, rows such as render, zoom, billboard mask, error.
-
-    Args:
-        columns: headings.
-        rows: pictures uint8 [H, W, 3] or [H, W], None where a method has none.
-        row_names: names of the rows, at the left.
-        error_row: the last row holds error maps; a colour bar says their scale.
-    """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LinearSegmentedColormap, Normalize
-    from matplotlib.figure import Figure
-
-    cell = 1.45
-    figure = Figure(figsize=(cell * len(columns) + 0.9, cell * len(rows) + 0.4), layout="constrained", dpi=200)
-    axes = figure.subplots(len(rows), len(columns), squeeze=False)
-    for line, (pictures, row_name) in enumerate(zip(rows, row_names, strict=True)):
-        for column, picture in enumerate(pictures):
-            axis = axes[line, column]
-            axis.set_xticks([])
-            axis.set_yticks([])
-            if picture is None:
-                axis.axis("off")
-            else:
-                small = max(picture.shape[:2]) <= 128
-                axis.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest" if small else "antialiased")
-                axis.spines[:].set_color("#999999")
-            if line == 0:
-                axis.set_title(columns[column], fontsize=9)
-            if column == 0:
-                axis.set_ylabel(row_name, fontsize=8)
-                if picture is None:
-                    axis.axis("on")
-                    axis.spines[:].set_visible(False)
-    if error_row:
-        ramp = LinearSegmentedColormap.from_list("error", [tuple(v / 255 for v in colour) for colour in RAMP])
-        bar = figure.colorbar(ScalarMappable(Normalize(0, ERROR_MAX), ramp), ax=axes[-1, :].tolist(), shrink=0.9)
-        bar.set_label("|error|, sRGB [1]", fontsize=7)
-        bar.ax.tick_params(labelsize=7)
+    handles, labels = axes[0].get_legend_handles_labels()
+    if labels:
+        figure.legend(handles, labels, loc="lower center", ncols=min(5, len(labels)), fontsize=7, frameon=False)
     return figure
 
 
@@ -140,4 +103,4 @@ def save_figure(figure: "Figure", path: Path) -> None:
     """Writes a figure in the format of the path's suffix, without time stamps: equal figures are equal files."""
     none = {"png": {"Software": None}, "pdf": {"CreationDate": None, "Producer": None, "Creator": None}}
     kind = path.suffix.lstrip(".")
-    figure.savefig(path, format=kind, metadata=none.get(kind), bbox_inches="tight")
+    figure.savefig(path, format=kind, metadata=none.get(kind))

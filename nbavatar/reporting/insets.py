@@ -6,7 +6,7 @@ picture without contact is shown around the middle of its foreground.
 
 import numpy as np
 
-__all__ = ["contact_window", "cut"]
+__all__ = ["contact_pixels", "contact_window", "cut"]
 
 _HEAD, _HANDS = 1, (2, 3)
 
@@ -26,9 +26,7 @@ def contact_window(label: np.ndarray | None, alpha: np.ndarray, *, share: float 
     side = max(1, min(round(share * min(height, width)), height, width))
     centre = None
     if label is not None:
-        hands = np.isin(label, _HANDS)
-        near = _grown(label == _HEAD, max(1, round(0.01 * min(height, width)))) & hands
-        centre = _middle(near)
+        centre = _middle(_contact(label))
     if centre is None:
         centre = _middle(alpha > 127) or (width / 2, height / 2)
     x0 = int(np.clip(round(centre[0] - side / 2), 0, width - side))
@@ -36,10 +34,20 @@ def contact_window(label: np.ndarray | None, alpha: np.ndarray, *, share: float 
     return x0, y0, x0 + side, y0 + side
 
 
+def contact_pixels(label: np.ndarray) -> int:
+    """How many pixels of a hand lie within reach of a head pixel; label as in ``contact_window``."""
+    return int(_contact(label).sum())
+
+
 def cut(picture: np.ndarray, window: tuple[int, int, int, int]) -> np.ndarray:
     """The part of a picture [H, W, ...] inside a window (x0, y0, x1, y1)."""
     x0, y0, x1, y1 = window
     return np.ascontiguousarray(picture[y0:y1, x0:x1])
+
+
+def _contact(label: np.ndarray) -> np.ndarray:
+    """Hand pixels within 1% of the picture's shorter side of a head pixel."""
+    return _grown(label == _HEAD, max(1, round(0.01 * min(label.shape)))) & np.isin(label, _HANDS)
 
 
 def _grown(mask: np.ndarray, steps: int) -> np.ndarray:
