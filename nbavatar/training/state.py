@@ -2,6 +2,7 @@
 
     state.pt        model, optimizer, step and clock of the last checkpoint
     events.jsonl    one line per logged step
+    tensorboard/    the same numbers and the previews as event files
     key.json        what the state belongs to: configuration, code and inputs
     previews/       pictures, named by step
 
@@ -20,6 +21,7 @@ import torch
 
 from nbavatar.errors import DataError
 from nbavatar.io.atomic import atomic_write
+from nbavatar.io.eventfile import EventFile
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import canonical_json, write_json
 
@@ -37,6 +39,8 @@ class RunFolder:
     def __init__(self, path: str | os.PathLike[str], key: Mapping[str, Any]) -> None:
         self.path = Path(path)
         self.moved_to: Path | None = None
+        self._curves: EventFile | None = None
+        self._first = 0
         key_file = self.path / "key.json"
         if self.path.exists() and not self._belongs(key_file, key):
             stamp = time.strftime("%Y%m%d-%H%M%S")
@@ -74,6 +78,7 @@ class RunFolder:
                 file, expected="a training state", found=f"a damaged file ({reason})", fix=f"delete {self.path}"
             ) from error
         self._rewrite_events([event for event in self.events() if event.get("step", 0) <= state["step"]])
+        self._first = state["step"] + 1
         return state
 
     def save(self, state: Mapping[str, Any]) -> None:
@@ -82,9 +87,11 @@ class RunFolder:
             torch.save(dict(state), temporary)
 
     def log(self, event: Mapping[str, Any]) -> None:
-        """Append one line to the events."""
+        """Append one line to the events, and its numbers to the curves."""
         with open(self.path / "events.jsonl", "a", encoding="utf-8") as stream:
             stream.write(canonical_json(dict(event)) + "\n")
+        numbers = {f"train/{name}": value for name, value in event.items() if name != "step" and value is not None}
+        self._event_file().scalars(event["step"], numbers)
 
     def events(self) -> list[dict[str, Any]]:
         """All whole lines of the events; one that was cut off by a crash is skipped."""
@@ -101,8 +108,16 @@ class RunFolder:
 
     def preview(self, step: int, image: np.ndarray) -> None:
         """Store one picture, uint8 (H, W, 3)."""
+        png = encode_png(image)
         with atomic_write(self.path / "previews" / f"step_{step:07d}.png") as temporary:
-            temporary.write_bytes(encode_png(image))
+            temporary.write_bytes(png)
+        self._event_file().image(step, "preview", png, image.shape[1], image.shape[0])
+
+    def _event_file(self) -> EventFile:
+        """The event file of this run, begun when there is something to write."""
+        if self._curves is None:
+            self._curves = EventFile(self.path / "tensorboard", self._first)
+        return self._curves
 
     def _rewrite_events(self, events: list[dict[str, Any]]) -> None:
         if events == self.events() and (self.path / "events.jsonl").exists():
