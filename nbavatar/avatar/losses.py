@@ -42,8 +42,10 @@ def loss_dice(predicted: Tensor, target: Tensor, *, missed: Tensor | float = 0.0
         missed: sum t^2 over pixels that lie outside the given window of a larger frame.
 
     Returns:
-        Scalar in [0, 1].
+        Scalar in [0, 1], at least float32: sums of a large image, and the constant that keeps 0/0 away, do not fit half
+        precision.
     """
+    predicted, target = _widened(predicted), _widened(target)
     overlap = 2.0 * (predicted * target).sum()
     areas = predicted.square().sum() + target.square().sum() + missed
     return 1.0 - (overlap + _EPS) / (areas + _EPS)
@@ -58,8 +60,9 @@ def loss_dice_haha(predicted: Tensor, target: Tensor) -> Tensor:
         predicted, target: float [..., H, W] in [0, 1].
 
     Returns:
-        Scalar.
+        Scalar, at least float32.
     """
+    predicted, target = _widened(predicted), _widened(target)
     overlap = (predicted * target).sum()
     return 1.0 - (2.0 * overlap + 1.0) / (overlap + target.square().sum() + 1.0)
 
@@ -129,8 +132,16 @@ def _deviation(values: Tensor) -> Tensor:
     count = values.shape[1]
     if count < 2:
         return values.new_zeros(())
+    # Deviations do not depend on a common shift; taken from the first neighbour, close numbers differ exactly.
+    values = values - values[:, :1].detach()
     variance = (values - values.mean(1, keepdim=True)).square().sum(1) / (count - 1)
-    return ((variance + _EPS).sqrt() - _EPS**0.5).mean()
+    # sqrt(variance + eps) - sqrt(eps), written without the difference, which loses all digits of a small variance.
+    return (variance / ((variance + _EPS).sqrt() + _EPS**0.5)).mean()
+
+
+def _widened(values: Tensor) -> Tensor:
+    """The values in float32 where they are narrower."""
+    return values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
 
 
 def loss_delta(offsets: Tensor) -> Tensor:

@@ -70,6 +70,9 @@ class UNet(nn.Module):
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Decode features (B, C+1, H, W) to colour (B, 3, H, W) and opacity (B, 1, H, W).
 
+        Under autocast to half precision an activation beyond 65504 would end in NaN; such a batch is decoded again in
+        the weights' own precision. The result is never narrower than float32.
+
         Raises:
             ValueError: H or W is not a multiple of 2^depth.
         """
@@ -78,6 +81,13 @@ class UNet(nn.Module):
             raise ValueError(
                 f"U-Net input: height and width must be multiples of {self.multiple}, found {height}x{width}"
             )
+        colour, opacity = self._logits(features)
+        if colour.dtype == torch.float16 and not bool(torch.isfinite(colour).all() & torch.isfinite(opacity).all()):
+            with torch.autocast(features.device.type, enabled=False):
+                colour, opacity = self._logits(features)
+        return torch.sigmoid(_widened(colour)), torch.sigmoid(_widened(opacity))
+
+    def _logits(self, features: Tensor) -> tuple[Tensor, Tensor]:
         value = self.stem(features)
         skips = []
         for stage in self.down:
@@ -86,7 +96,12 @@ class UNet(nn.Module):
         for level in reversed(range(len(skips))):
             value = self.lift[level](self.upsample(value))
             value = self.merge[level](torch.cat((value, skips[level]), dim=1))
-        return torch.sigmoid(self.colour(value).float()), torch.sigmoid(self.opacity(value).float())
+        return self.colour(value), self.opacity(value)
+
+
+def _widened(values: Tensor) -> Tensor:
+    """The values in float32 where they are narrower."""
+    return values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
 
 
 def macs(network: UNet, height: int, width: int) -> int:

@@ -67,7 +67,7 @@ def canonical_rank(
 def _order_twins(
     order: np.ndarray, geometry: np.ndarray, members: np.ndarray, alpha: Tensor, features: Tensor
 ) -> np.ndarray:
-    """Orders runs of billboards of identical geometry by the bytes of their textures."""
+    """Orders runs of billboards of identical geometry by their textures, in the same way in every precision."""
     sorted_geometry = geometry[order]
     same = (sorted_geometry[1:] == sorted_geometry[:-1]).all(1)
     if not same.any():
@@ -81,7 +81,8 @@ def _order_twins(
             def texture_bytes(position: int) -> bytes:
                 row = int(members[position])
                 parts = (alpha[row], features[row])
-                return b"".join(np.ascontiguousarray(part.detach().cpu().numpy()).tobytes() for part in parts)
+                # Widened: float32 and float64 copies of one texture must compare alike.
+                return b"".join(part.detach().double().cpu().numpy().tobytes() for part in parts)
 
             order[start:end] = sorted(run, key=texture_bytes)
     return order
