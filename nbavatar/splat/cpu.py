@@ -5,7 +5,7 @@ threads.
 """
 
 from dataclasses import fields
-from pathlib import Path
+from functools import cache
 
 import numpy as np
 import torch
@@ -13,9 +13,10 @@ from numba import types
 from torch import Tensor
 
 from nbavatar.raster import binning
-from nbavatar.raster.compile import prepare, run_workers
+from nbavatar.raster.compile import run_workers
 from nbavatar.raster.projection import Projection as PatchProjection
 from nbavatar.splat import cpu_kernels
+from nbavatar.splat.compile import prepare
 from nbavatar.splat.lanes import LANES
 from nbavatar.splat.projection import FAINTEST, Projection, support_box
 from nbavatar.splat.reference import SplatSettings
@@ -159,6 +160,7 @@ def _patches(form: Tensor, opacities: Tensor, reach: Tensor, box: Tensor) -> Pat
     return PatchProjection(plane, opacities.double(), ones, ones, box)
 
 
+@cache
 def _prepare(dtype: torch.dtype) -> None:
     """Has every kernel compiled for a dtype."""
     real = types.float32 if dtype == torch.float32 else types.float64
@@ -180,5 +182,4 @@ def _prepare(dtype: torch.dtype) -> None:
                 array(real), array(real, 2),
             ),
         },
-        Path(__file__).parent,
     )  # fmt: skip

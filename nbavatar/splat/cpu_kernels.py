@@ -10,18 +10,14 @@ nine sums over its pixels, in its own coordinates u and v; each is written once,
 kernel adds those of a Gaussian up in a fixed order. Results do not depend on threads or timing.
 """
 
-from pathlib import Path
-
 import numpy as np
 
 from nbavatar.raster.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
-from nbavatar.raster.compile import inlined, keep_kernels, kernel
 from nbavatar.raster.memory import fetch_add, get, pointer, put
+from nbavatar.splat.compile import inlined, kernel
 from nbavatar.splat.lanes import LANES, bits, choose, falloff, first_lanes, load, minimum, ramp, spread, store, total
 
 __all__ = ["CHUNKS", "PARTS", "gather_parts", "traverse"]
-
-keep_kernels(Path(__file__).parent, ("cpu_kernels.py", "lanes.py"))
 
 CHUNKS = TILE_WIDTH // LANES  # of a row of a tile, at most
 PARTS = 9  # sums that a tile leaves for a Gaussian
@@ -38,9 +34,12 @@ def _count_bits(word):
 
 
 @inlined
-def _span(p, middle, rest, first, end, origin):
-    """Columns first ... end narrowed to those where u^2 <= rest; `middle` is where u = 0, less the origin."""
-    half = np.sqrt(rest) / p + _SLACK
+def _span(wide, middle, rest, first, end, origin):
+    """Columns first ... end narrowed to those where u^2 <= rest.
+
+    `wide` is the distance in which u grows by 1 and `middle`, less the origin, the place where u = 0.
+    """
+    half = np.sqrt(rest) * wide + _SLACK
     low, high = max(middle - half, np.float64(first - origin)), min(middle + half, np.float64(end - 1 - origin))
     if not (low <= high):
         return first, first
@@ -107,6 +106,7 @@ def traverse(turn, tiles, start, members_, record_, box, colours_, limits_, shap
                 x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
                 p, s, u_origin = get(record, r), get(record, r + 1), get(record, r + 2)
                 k, v_origin, reach = get(record, r + 4), get(record, r + 5), get(record, r + 8)
+                wide = 1.0 / p
                 opacity = spread(zero + type(zero)(get(record, r + 10)))
                 slope = spread(type(zero)(p)) * steps
                 r_, g_, b_ = (
@@ -118,7 +118,7 @@ def traverse(turn, tiles, start, members_, record_, box, colours_, limits_, shap
                     if rest < 0.0:
                         continue
                     u_row = s * (y - y_origin) + u_origin
-                    x_from, x_to = _span(p, -u_row / p, rest, x_first, x_end, x_origin)
+                    x_from, x_to = _span(wide, -u_row * wide, rest, x_first, x_end, x_origin)
                     vv = spread(type(zero)(v * v))
                     for x in range(x_from, x_to, LANES):
                         u = spread(type(zero)(p * (x - x_origin) + u_row)) + slope

@@ -110,10 +110,17 @@ def render_gaussians(
         dtype = torch.promote_types(dtype, tensor.dtype)
     settings = SplatSettings(width, height, alpha_min, alpha_max, t_min)
     backend = _resolve(backend, means.device)
+    project, shade, blend = project_gaussians, harmonic_colours, blend_reference
+    if backend == "cpu":
+        from nbavatar.splat.cpu import blend_cpu as blend  # Numba is loaded only when it is needed
+
+        if means.device.type == "cpu":
+            from nbavatar.splat.cpu_projection import harmonic_colours_cpu as shade
+            from nbavatar.splat.cpu_projection import project_gaussians_cpu as project
     rgb = colours
     if degree is not None:
         offsets = means.double() - camera_centre(viewmat.detach().double())
-        rgb = harmonic_colours(colours.to(dtype), offsets.to(dtype), degree)
+        rgb = shade(colours.to(dtype), offsets, degree)
     if backend == "gsplat":
         from nbavatar.splat.gsplat_backend import render_gsplat
 
@@ -122,13 +129,10 @@ def render_gaussians(
             screen_offsets=screen_offsets,
         )  # fmt: skip
         return SplatImage(*(tensor.to(dtype) for tensor in rendered))
-    projection = project_gaussians(
+    projection = project(
         means, quats, scales, viewmat, K, width, height, near=near, low_pass=low_pass, screen_offsets=screen_offsets
     )
     rank = canonical_rank(projection.depth, means, quats, scales, colours, opacities)
-    blend = blend_reference
-    if backend == "cpu":
-        from nbavatar.splat.cpu import blend_cpu as blend  # Numba is loaded only when it is needed
     image, alpha = blend(projection, rank, opacities.to(dtype), rgb.to(dtype), settings)
     return SplatImage(image.to(dtype), alpha.to(dtype), projection.radii.to(dtype))
 

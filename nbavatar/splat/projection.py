@@ -29,11 +29,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["FAINTEST", "Projection", "camera_centre", "project_gaussians", "support_box"]
+__all__ = ["FAINTEST", "MARGIN", "SIGMAS", "Projection", "camera_centre", "project_gaussians", "support_box"]
 
 FAINTEST = 1e-30  # alpha that counts as nothing even where no threshold is set
-_MARGIN = 0.15  # of the image, by which the clamp of the Jacobian lies outside of it
-_SIGMAS = 3.0  # of the radius that is reported
+MARGIN = 0.15  # of the image, by which the clamp of the Jacobian lies outside of it
+SIGMAS = 3.0  # of the radius that is reported
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ def project_gaussians(
     tx, ty = px / z, py / z
     x, y = fx * tx + skew * ty + cx, fy * ty + cy
     # the direction at which J is taken: y first, for with skew the range of x depends on it
-    ty = ty.clamp((-_MARGIN * height - cy) / fy, ((1 + _MARGIN) * height - cy) / fy)
-    side = torch.minimum(fx * tx + skew * ty, (1 + _MARGIN) * width - cx)
-    side = torch.maximum(side, -_MARGIN * width - cx)
+    ty = ty.clamp((-MARGIN * height - cy) / fy, ((1 + MARGIN) * height - cy) / fy)
+    side = torch.minimum(fx * tx + skew * ty, (1 + MARGIN) * width - cx)
+    side = torch.maximum(side, -MARGIN * width - cx)
 
     row_x, row_y = [], []
     for axis, scale in zip(_axes(quats.double()), scales.double().unbind(-1), strict=True):
@@ -139,7 +139,7 @@ def project_gaussians(
     form = torch.stack([p, -p * b / c, 1.0 / c.sqrt(), x, y], -1)
     with torch.no_grad():
         spread = (0.25 * (a - c).square() + b * b).sqrt()
-        radius = _SIGMAS * (0.5 * (a + c) + spread).sqrt()
+        radius = SIGMAS * (0.5 * (a + c) + spread).sqrt()
         on_image = (x + radius > 0) & (x - radius < width) & (y + radius > 0) & (y - radius < height)
         radii = torch.where(visible & on_image, radius, 0.0)
     return Projection(form, torch.stack([a, c], -1).detach(), pz.detach(), visible, radii)

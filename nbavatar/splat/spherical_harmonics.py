@@ -14,14 +14,14 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["DEGREES", "basis", "harmonic_colours", "harmonic_count"]
+__all__ = ["DEGREES", "L0", "L1", "L2", "L3", "basis", "harmonic_colours", "harmonic_count"]
 
 DEGREES = (0, 1, 2, 3)
 
-_L0 = math.sqrt(1 / (4 * math.pi))
-_L1 = math.sqrt(3 / (4 * math.pi))
-_L2 = (math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)), math.sqrt(15 / (16 * math.pi)))
-_L3 = (
+L0 = math.sqrt(1 / (4 * math.pi))
+L1 = math.sqrt(3 / (4 * math.pi))
+L2 = (math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)), math.sqrt(15 / (16 * math.pi)))
+L3 = (
     math.sqrt(35 / (32 * math.pi)),
     math.sqrt(105 / (4 * math.pi)),
     math.sqrt(21 / (32 * math.pi)),
@@ -46,15 +46,15 @@ def basis(directions: Tensor, degree: int) -> list[Tensor]:
         `harmonic_count(degree)` tensors (...), in the order of the module's description.
     """
     x, y, z = directions.unbind(-1)
-    values = [torch.full_like(x, _L0)]
+    values = [torch.full_like(x, L0)]
     if degree > 0:
-        values += [-_L1 * y, _L1 * z, -_L1 * x]
+        values += [-L1 * y, L1 * z, -L1 * x]
     if degree > 1:
-        a, b, c = _L2
+        a, b, c = L2
         xx, yy, zz = x * x, y * y, z * z
         values += [a * (x * y), -a * (y * z), b * (3 * zz - 1), -a * (x * z), c * (xx - yy)]
         if degree > 2:
-            a, b, c, d, e = _L3
+            a, b, c, d, e = L3
             values += [
                 -a * y * (3 * xx - yy),
                 b * (x * y) * z,
@@ -76,7 +76,7 @@ def harmonic_colours(coefficients: Tensor, offsets: Tensor, degree: int) -> Tens
         degree: 0 to 3.
 
     Returns:
-        (N, 3) colours, at least 0. Where the cut-off acts the gradient is 0.
+        (N, 3) colours, at least 0, in the dtype of the coefficients. Where the cut-off acts the gradient is 0.
     """
     terms = coefficients.unbind(1)
     directions = offsets
@@ -86,8 +86,10 @@ def harmonic_colours(coefficients: Tensor, offsets: Tensor, degree: int) -> Tens
         squared = x * x + y * y + z * z
         somewhere = squared > 0
         length = torch.where(somewhere, squared, 1.0).sqrt()
-        directions = torch.stack([x / length, y / length, torch.where(somewhere, z / length, 1.0)], -1)
-    colour = terms[0] * _L0 + 0.5
+        directions = torch.stack([x / length, y / length, torch.where(somewhere, z / length, 1.0)], -1).to(
+            coefficients.dtype
+        )
+    colour = terms[0] * L0 + 0.5
     for value, term in zip(basis(directions, degree)[1:], terms[1:], strict=False):
         colour = colour + value[:, None] * term
     return colour.clamp_min(0.0)
