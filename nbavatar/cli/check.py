@@ -129,7 +129,7 @@ def _write_overlays(report: CaptureReport, out: Path) -> None:
             label = mask[1] if mask else alpha
             if label is not None and label.max(initial=0) > 3:
                 label = (label > 127).astype(np.uint8)
-            meshes = {part: (mesh[part], faces) for part, (faces, _) in report.topology.items()}
+            meshes = {part: (mesh[part], faces) for part, (faces, _) in report.topology.items() if part in mesh}
             over = mesh_over_image(image, camera, meshes, label)
             rows.append([(f"{camera.name} {frame}", image), ("meshes, outline of masks", over)])
         if rows:

@@ -184,15 +184,23 @@ def read_topology(root: Path) -> dict[str, tuple[np.ndarray, np.ndarray | None]]
 def read_mesh(
     root: Path, frame: str, topology: Mapping[str, tuple[np.ndarray, np.ndarray | None]]
 ) -> dict[str, np.ndarray]:
-    """Reads one frame's vertices, float32 `[V, 3]` [m], of every part (and `head_rigid` where stored)."""
+    """Reads one frame's vertices, float32 `[V, 3]` [m], of every part (and `head_rigid` where stored).
+
+    A part that the file does not have is not in that frame, and not in the result; one part at least has to be.
+    """
     path = root / "meshes" / f"{frame}.npz"
-    arrays, _ = read_arrays(path, required=tuple(topology))
+    arrays, _ = read_arrays(path)
+    if not set(topology) & set(arrays):
+        found = f"only {', '.join(arrays)}" if arrays else "nothing"
+        raise DataError.of(path, expected=f"vertices of {' or '.join(topology)}", found=found)
     result = {}
     for name in (*topology, "head_rigid"):
         if name in arrays and (name != "head_rigid" or "head" in topology):
             faces, rest = topology["head" if name == "head_rigid" else name]
             _check_vertices(arrays[name], faces, path, name, None if rest is None else len(rest))
             result[name] = arrays[name].astype(np.float32)
+    if "head_rigid" in result and "head" not in result:
+        raise DataError.of(path, "head_rigid", expected="head beside it", found="head_rigid alone")
     if "head_rigid" in result and result["head_rigid"].shape != result["head"].shape:
         expected, found = f"{len(result['head'])} vertices as in head", len(result["head_rigid"])
         raise DataError.of(path, "head_rigid", expected=expected, found=found)

@@ -128,12 +128,12 @@ def _check_meshes(root: Path, report: CaptureReport, found: _Collector) -> dict[
         mesh = found.attempt("meshes", lambda: read_mesh(root, frame, report.topology))  # noqa: B023
         if mesh is None:
             continue
-        first = next(iter(meshes.values()), mesh)
+        first = {name: verts for earlier in reversed(meshes.values()) for name, verts in earlier.items()}
         path = root / "meshes" / f"{frame}.npz"
         if {n: v.shape for n, v in mesh.items() if n in first} != {n: v.shape for n, v in first.items() if n in mesh}:
             found.note("counts", f"{path}: expected as many vertices as in the frames before, found another number")
             continue
-        if ("head_rigid" in mesh) != ("head_rigid" in first):
+        if "head" in mesh and "head" in first and ("head_rigid" in mesh) != ("head_rigid" in first):
             found.note("rigid", f"{path}: head_rigid: expected it in all frames or in none, found it only in some")
         for part, (low, high) in _SIZES.items():
             if part in mesh:
@@ -146,8 +146,12 @@ def _check_meshes(root: Path, report: CaptureReport, found: _Collector) -> dict[
                     found.note(f"size {part}", str(error))
         meshes[frame] = mesh
     if meshes:
-        mesh = next(iter(meshes.values()))
         for part, (faces, _) in report.topology.items():
+            mesh = next((mesh for mesh in meshes.values() if part in mesh), None)
+            if mesh is None:
+                where, fix = root / "meshes", f"leave {part}_faces out of topology.npz if it is nowhere"
+                found.note(f"absent {part}", str(DataError.of(where, part, expected="vertices", found="none", fix=fix)))
+                continue
             corners = mesh[part][faces].astype(np.float64) - mesh[part].mean(axis=0)
             volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
             if volume < 0:
@@ -240,6 +244,8 @@ def _overlap(
     height, width = small.shape
     covered = np.zeros_like(small)
     for part, (faces, _) in topology.items():
+        if part not in mesh:
+            continue
         covered |= rasterize_mesh(mesh[part], faces, K, width, height, cam_from_world=camera.cam_from_world)[0] >= 0
     return float((covered & small).sum() / max((covered | small).sum(), 1))
 

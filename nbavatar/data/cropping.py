@@ -147,6 +147,7 @@ def _undistorted(box: np.ndarray, camera: Camera) -> np.ndarray:
 
 def _mesh_box(sequence: MeshSequence, camera: Camera, row: int) -> np.ndarray:
     points = np.concatenate([part.verts[row] for part in sequence.parts.values()]).astype(np.float64)
+    points = points[np.isfinite(points).all(axis=1)]  # parts that are not in this frame are NaN
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels, depth = project(points, camera.K, camera.cam_from_world)
     pixels = pixels[depth > 1e-3]

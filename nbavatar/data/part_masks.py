@@ -114,15 +114,23 @@ class PartCutter:
     def silhouettes(self, frame: str) -> Silhouettes:
         """Projects the meshes of one frame into the (distorted) image."""
         row = self._sequence.index([frame])[0]
-        world = []
+        world, absent, count = [], [], 0
         for name, part in self._sequence.parts.items():
             verts = part.verts[row].astype(np.float64)
+            there = bool(np.isfinite(verts).all())
+            if not there:
+                verts = part.rest.astype(np.float64)
             world.append(verts)
             if name in self._borders:
                 flare = _COLLAR_FLARE if name == "head" else _SLEEVE_FLARE
                 world.append(_extrude(verts, self._borders[name], self._lengths[name], flare))
+            before, count = count, sum(map(len, world))
+            if not there:
+                absent.append(slice(before, count))
         pose = self._camera.cam_from_world
         points = np.concatenate(world) @ pose[:3, :3].T + pose[:3, 3]
+        for rows in absent:  # a part that is not in this frame goes where no camera looks
+            points[rows] = (0.0, 0.0, -1.0)
         points = distort_vertices(points, self._camera.distortion, self._reach)
         width, height = self._camera.width, self._camera.height
         face, _, depth = rasterize_mesh(points, self._faces[self._solid], self._camera.K, width, height)

@@ -164,8 +164,11 @@ def test_topology_and_vertices_are_checked(capture):
         np.savez(capture / "meshes/t1.npz", **{**mesh, **change})
         with pytest.raises(DataError, match=line):
             read_mesh(capture, "t1", topology)
-    np.savez(capture / "meshes/t1.npz", head=mesh["head"])
-    with pytest.raises(DataError, match="right_hand: expected an array of this name"):
+    np.savez(capture / "meshes/t1.npz", head_rigid=mesh["head_rigid"], right_hand=mesh["right_hand"])
+    with pytest.raises(DataError, match="head_rigid: expected head beside it, found head_rigid alone"):
+        read_mesh(capture, "t1", topology)
+    np.savez(capture / "meshes/t1.npz", body=mesh["head"])
+    with pytest.raises(DataError, match="expected vertices of head or right_hand, found only body"):
         read_mesh(capture, "t1", topology)
     np.savez(capture / "meshes/topology.npz", faces=np.zeros((1, 3)))
     with pytest.raises(DataError, match="at least one of head_faces"):
@@ -190,5 +193,33 @@ def test_head_rigid_in_some_frames_only_is_refused(capture):
     mesh = dict(np.load(capture / "meshes/t3.npz"))
     mesh.pop("head_rigid")
     np.savez(capture / "meshes/t3.npz", **mesh)
-    with pytest.raises(DataError, match="head_rigid in all frames or in none, found it in 4 of 5"):
+    with pytest.raises(DataError, match="head_rigid beside every head or none, found it in 4 of 5 frames"):
         build_capture_tracks(open_capture(capture), [f"t{i}" for i in range(5)], contact="solve")
+
+
+def test_a_part_may_come_and_go(capture):
+    names = [f"t{i}" for i in range(5)]
+    whole, _ = build_capture_tracks(open_capture(capture), names, contact="given")
+    for gone, part in (("t0", "right_hand"), ("t3", "right_hand"), ("t2", "head")):
+        mesh = dict(np.load(capture / f"meshes/{gone}.npz"))
+        for name in (part, *(["head_rigid"] if part == "head" else [])):
+            mesh.pop(name)
+        np.savez(capture / f"meshes/{gone}.npz", **mesh)
+    sequence, _ = build_capture_tracks(open_capture(capture), names, contact="given")
+    for part, missing in (("right_hand", [0, 3]), ("head", [2])):
+        kept = [i for i in range(5) if i not in missing]
+        np.testing.assert_array_equal(sequence.parts[part].verts[kept], whole.parts[part].verts[kept])
+        assert np.isnan(sequence.parts[part].verts[missing]).all()
+        assert np.isfinite(sequence.parts[part].rest).all()
+    assert np.isnan(sequence.extras["head_rigid"][2]).all()
+
+
+def test_a_part_that_is_nowhere_is_refused(capture):
+    for i in range(5):
+        mesh = dict(np.load(capture / f"meshes/t{i}.npz"))
+        mesh.pop("right_hand")
+        np.savez(capture / f"meshes/t{i}.npz", **mesh)
+    with pytest.raises(
+        DataError, match="right_hand in a frame at least, found it in none; leave right_hand_faces"
+    ):
+        build_capture_tracks(open_capture(capture), [f"t{i}" for i in range(5)], contact="given")
