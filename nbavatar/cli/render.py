@@ -6,6 +6,9 @@
 pixels
 --protocol  JSON text or file, for example {"name": "nv1024", "split": "novel_view"}: novel view = training
             frames in a held-out camera; self-reenactment = held-out frames in the training cameras
+--preset    accurate, balanced or fast: a setting that `nbavatar tradeoff` has measured, from --presets or from
+            presets.json beside the model; it decides what the protocol says of precision, order and window
+--max-ms    [ms a picture], --min-psnr [dB]: the best measured setting in time, the fastest that is good enough
 --out       frame pack (.zip): frames "<camera>/<frame>", layers rgb (on the protocol's background), alpha (opacity of
             the picture) and nb_alpha (opacity of the billboards or Gaussians), uint8
 """
@@ -14,6 +17,7 @@ import argparse
 from typing import Any
 
 from nbavatar.cli.common import progress, read_mapping
+from nbavatar.cli.settings import add_preset_arguments, tuned_avatar
 from nbavatar.config.core import from_mapping, to_mapping
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.devices import device_name, lease_device
@@ -37,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--protocol", default="{}", metavar="JSON|FILE", help="what to render (ProtocolConfig)")
     parser.add_argument("--out", required=True, metavar="ZIP", help="frame pack to write")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
+    add_preset_arguments(parser, budget=True)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -68,6 +73,7 @@ def _render(args: argparse.Namespace, protocol: ProtocolConfig, device: str) -> 
         if (view.width, view.height) != size:
             expected, found = f"{size[0]}x{size[1]} as the first camera", f"{view.width}x{view.height}"
             raise DataError.of(packs[view.pack].path, "size", expected=expected, found=found)
+    avatar, tuned = tuned_avatar(args, avatar, device, size, protocol.preset)
     names = {id(view): f"{view.camera}/{view.frame}" for view in views}
     frames = list(names.values())
     inputs = {"model": args.model, "meshes": args.meshes} | {f"frames.{i}": path for i, path in enumerate(args.frames)}
@@ -92,7 +98,8 @@ def _render(args: argparse.Namespace, protocol: ProtocolConfig, device: str) -> 
             config=to_mapping(protocol),
             inputs=inputs,
             device=device_name(device),
-            extra={"training": {"config": avatar.record.get("config"), "code": avatar.record.get("code"), **trained}},
+            extra={"training": {"config": avatar.record.get("config"), "code": avatar.record.get("code"), **trained}}
+            | ({"tuned": tuned} if tuned else {}),
         ),
     }
     with FramePackWriter(args.out, manifest) as writer:

@@ -3,6 +3,8 @@
     --model    model.pt of `nbavatar train`
     --meshes   mesh sequence (.npz)
     --frames   frame packs (.zip): cameras and picture sizes; pixels are not read
+    --preset   accurate, balanced or fast: time a setting that `nbavatar tradeoff` has measured (--presets, or
+               presets.json beside the model)
     --out      JSON: median milliseconds per stage (pose, raster with neural textures and with RGB, U-Net per
                arithmetic, compose, total; a baseline has fewer), frames a second, picture size, number of primitives,
                size of the model, what its training took, peak memory, device, threads
@@ -15,6 +17,7 @@ import argparse
 import os
 
 from nbavatar.cli.common import add_cfg_argument, stage_config
+from nbavatar.cli.settings import add_preset_arguments, tuned_avatar
 from nbavatar.config.avatar import SpeedConfig
 from nbavatar.config.core import to_mapping
 from nbavatar.devices import device_name, lease_device
@@ -31,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", nargs="+", required=True, metavar="ZIP", help="frame packs of the cameras to time")
     parser.add_argument("--out", required=True, metavar="JSON", help="record to write")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
+    add_preset_arguments(parser, budget=False)
     add_cfg_argument(parser, SpeedConfig)
 
 
@@ -51,6 +55,7 @@ def main(args: argparse.Namespace) -> int:
         wanted = max(1, config.frames // len(packs))
         chosen = [select_frames(pack.frames, {}, "all", wanted) for pack in packs]
         views = views_of(packs, sequence.frames, chosen)[: config.frames]
+        avatar, tuned = tuned_avatar(args, avatar, device, (views[0].width, views[0].height))
         result = measure_speed(avatar, sequence, views, config, device=device)
         width, height = result["size"]
         result["model_mb"] = round(os.path.getsize(args.model) / 1e6, 3)
@@ -58,6 +63,8 @@ def main(args: argparse.Namespace) -> int:
         for name in ("model_bytes", "train_seconds", "steps"):
             result[name] = trained.get(name)
         result["train_peak_memory_mb"] = trained.get("peak_memory_mb")
+        if tuned:
+            result["tuned"] = tuned
         inputs = {"model": args.model, "meshes": args.meshes} | {f"frames.{i}": p for i, p in enumerate(args.frames)}
         record = run_record("speed", config=to_mapping(config), inputs=inputs, device=device_name(device))
     write_json(args.out, record | {"speed": result})

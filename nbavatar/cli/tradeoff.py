@@ -26,16 +26,17 @@ from typing import Any
 
 from nbavatar.cli.common import progress, read_mapping
 from nbavatar.cli.evaluate import read_protocol
+from nbavatar.cli.settings import timed_device
 from nbavatar.config.core import to_mapping
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.config.tradeoff import TradeoffConfig, read_sheet
-from nbavatar.devices import device_name, lease_device
+from nbavatar.devices import lease_device
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import write_json
 from nbavatar.provenance import code_digest, file_digest, run_record
 
-__all__ = ["add_arguments", "main", "timed_device"]
+__all__ = ["add_arguments", "main"]
 
 _CHOOSERS = 4096  # most views kept in mind when contributions are asked for
 
@@ -53,7 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-minutes", type=float, metavar="MIN", help="stop after this time; a later call goes on")
     parser.add_argument("--no-store", action="store_true", help="do not put presets.json beside the model")
     parser.add_argument("--savings", action="store_true", help="measure the savings, each on and off")
-    parser.add_argument("--offline", action="store_true", help="measure the stages before training; needs --meshes only")
+    parser.add_argument(
+        "--offline", action="store_true", help="measure the stages before training; needs --meshes only"
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -69,13 +72,6 @@ def main(args: argparse.Namespace) -> int:
         packs = [stack.enter_context(FramePack(path)) for path in args.frames]
         trains = [stack.enter_context(FramePack(path)) for path in args.train_frames]
         return _sweep(args, sheet, protocol, device, packs, trains)
-
-
-def timed_device(device: str) -> str:
-    """Name of a device under which its times are kept: the CPU's with its threads."""
-    import torch
-
-    return device_name(device) + ("" if device == "cuda" else f", {torch.get_num_threads()} threads")
 
 
 def _offline(args: argparse.Namespace, sheet: TradeoffConfig) -> int:
@@ -131,7 +127,7 @@ def _sweep(
         "background": protocol.background,
         "refined": protocol.refined,
         "net": sheet.net,
-        "code": code_digest("tradeoff"),
+        "code": code_digest("render"),  # what draws; an edit of figures or words measures nothing anew
     }
     chooser = _Chooser(trains or packs, sequence, sheet.importance_views, device)
     if args.savings:
@@ -202,9 +198,7 @@ def _write_results(
                 save_figure(figure, path)
     places = [out / "presets.json"] + ([] if args.no_store else [presets_path(args.model[0])])
     for place in places:
-        store_presets(
-            place, model=digest, device=device, size=size, presets=entries, points=own, importance=importance
-        )
+        store_presets(place, model=digest, device=device, size=size, presets=entries, points=own, importance=importance)
     summary = {
         "kind": "tradeoff", "format": 1, "device": device, "size": list(size), "images": images,
         "complete": result.complete, "presets": entries, "paragraphs": paragraphs, "points": rows, "record": record,
@@ -244,9 +238,7 @@ def _shots(
         if (view.width, view.height) != size:
             expected, found = f"{size[0]}x{size[1]} as the first camera", f"{view.width}x{view.height}"
             raise DataError.of(packs[view.pack].path, "size", expected=expected, found=found)
-    truths = [
-        (packs[view.pack].read("rgb", view.frame), packs[view.pack].read("alpha", view.frame)) for view in chosen
-    ]
+    truths = [(packs[view.pack].read("rgb", view.frame), packs[view.pack].read("alpha", view.frame)) for view in chosen]
     shots = prepare_shots(
         sequence, parts, chosen, truths, protocol.background, net, refined=protocol.refined, device=device
     )

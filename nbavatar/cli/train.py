@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nbavatar.cli.common import add_cfg_argument, stage_config
+from nbavatar.cli.common import add_cfg_argument, stage_config, training_preset
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.config.core import to_mapping
 from nbavatar.devices import device_name, lease_device, peak_memory_mb
@@ -43,12 +43,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--history", metavar="JSONL", help="copy of the events to write when training is done")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
     parser.add_argument("--max-minutes", type=float, metavar="MIN", help="time budget instead of a number of steps")
+    parser.add_argument("--preset", metavar="NAME", help="take order, precision and window from a measured preset")
+    parser.add_argument("--presets", metavar="JSON", help="presets.json of an avatar like this one")
     add_cfg_argument(parser, TrainConfig)
 
 
 def main(args: argparse.Namespace) -> int:
     """Runs `nbavatar train`; 143 when it was told to terminate (its state is saved)."""
     config = stage_config(args, TrainConfig)
+    if args.preset:
+        config = training_preset(args.preset, args.presets, config)
     if args.max_minutes is not None:
         config = replace(config, max_minutes=args.max_minutes)
     inputs = {f"frames.{i}": path for i, path in enumerate(args.frames)} | {"meshes": args.meshes}

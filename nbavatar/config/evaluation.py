@@ -32,6 +32,10 @@ class ProtocolConfig:
     precision: str = option("fp32", "Arithmetic of the neural renderer.", choices=("fp32", "bf16", "fp16"))
     order: str | None = option(None, "Compositing order of the rasterizer; the model's own by default.")
     roi: bool | None = option(None, "Decode only a window around the avatar; the model's own choice by default.")
+    preset: str = option(
+        "", "Setting measured by `nbavatar tradeoff` that pictures are rendered with: accurate, balanced, fast; empty: "
+        "precision, order and window as said here.",
+    )  # fmt: skip
     refined: bool = option(True, "Use the per-frame refinement of training frames, where the model has one.")
 
 
@@ -69,6 +73,7 @@ class ReportConfig:
     title: str = option("NBAvatar: results", "Title of the page.")
     frames: int = option(3, "Frames shown per subject, variant and protocol, evenly spaced.", min=1, max=50)
     max_side: int = option(512, "Pictures are reduced to this side [px]; the files themselves are not.", min=32)
+    video_mb: float = option(4.0, "Videos up to this size are put into the page, larger ones linked [MB].", min=0.0)
 
 
 PROTOCOLS = {
@@ -84,8 +89,11 @@ def protocol_hash(protocol: ProtocolConfig, metrics: EvaluateConfig) -> str:
 
     The device and whether trivial answers are judged do not; frames and sizes are digested apart, from the files.
     """
+    said = to_mapping(protocol)
+    if not protocol.preset:  # figures from before there were presets keep their names
+        del said["preset"]
     values = {
-        "protocol": to_mapping(protocol),
+        "protocol": said,
         "nets": sorted(metrics.nets),
         "foreground_threshold": metrics.foreground_threshold,
     }

@@ -98,7 +98,7 @@ def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> list[int]:
 
 
 def choose_preset(points: Iterable[Point], exact: Point, limits: LimitConfig) -> Point:
-    """The fastest point within the limits; of equally fast ones the one with the least PSNR lost; else the exact one."""
+    """The fastest point within the limits, of equally fast ones the one with the least PSNR lost; or the exact one."""
     best, rank = exact, (exact.speedup, 0.0)
     for point in points:
         own = (point.speedup, -losses(point, exact)[0])

@@ -1,7 +1,8 @@
 """One point of the trade: what a setting costs, and what it changes.
 
-Times are taken in pairs, a picture at the exact setting beside each picture at the setting in question, and the speed-up
-is the median of their ratios: on a shared machine both are slowed alike, so ratios are far steadier than milliseconds.
+Times are taken in pairs, a picture at the exact setting beside each picture at the setting in question, and the
+speed-up is the median of their ratios: on a shared machine both are slowed alike, so ratios are far steadier than
+milliseconds.
 """
 
 import contextlib

@@ -225,7 +225,9 @@ def _solved(
     verts, spent, depth = [], [], 0.0
     for frame in frames:
         began = time.perf_counter()
-        result = solver.solve(head.verts[frame], [sequence.parts[name].verts[frame] for name in hands], None, None, None)
+        result = solver.solve(
+            head.verts[frame], [sequence.parts[name].verts[frame] for name in hands], None, None, None
+        )
         spent.append(1e3 * (time.perf_counter() - began))
         verts.append(result.head)
         depth = max(depth, result.depth[1])

@@ -156,7 +156,9 @@ def _switches(avatar: Avatar, shots: Sequence[Shot], importance: Tensor) -> list
     ]
     if avatar.architecture.texels > 1:
         half = (avatar.architecture.texels + 1) // 2
-        switches.append(_Switch(f"textures of {half} texels", "held-out pictures", tuned(texels=half), base, shots, True))
+        switches.append(
+            _Switch(f"textures of {half} texels", "held-out pictures", tuned(texels=half), base, shots, True)
+        )
     if len(avatar.parts) > 1:
         alone = avatar.parts[0]
         one = [dataclasses.replace(shot, verts={alone: shot.verts[alone]}) for shot in shots]

@@ -103,11 +103,17 @@ def points_markdown(points: Sequence[Point], presets: Mapping[str, Point]) -> st
 
 def offline_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     """Rows of `nbavatar.tradeoff.offline` as a table to read."""
-    head = ["stage", "knob", "value", "time [ms]", "error [mm]", "worst [mm]", "depth left [mm]", "from the dataset [mm]",
-            "faces", "what the error is"]  # fmt: skip
+    head = ["stage", "knob", "value", "time [ms]", "error [mm]", "worst [mm]", "depth left [mm]",
+            "from the dataset [mm]", "faces", "what the error is"]  # fmt: skip
     lines = ["| " + " | ".join(head) + " |", "|---|---|" + "---:|" * (len(head) - 3) + "---|"]
     for row in rows:
-        numbers = [("ms", ".1f"), ("error_mm", ".3f"), ("worst_mm", ".2f"), ("depth_mm", ".3f"), ("reference_mm", ".3f")]
+        numbers = [
+            ("ms", ".1f"),
+            ("error_mm", ".3f"),
+            ("worst_mm", ".2f"),
+            ("depth_mm", ".3f"),
+            ("reference_mm", ".3f"),
+        ]
         cells = [row["stage"], row["knob"], f"{row['value']:g}"]
         cells += ["" if row[key] is None else format(row[key], form) for key, form in numbers]
         cells += ["" if row["faces"] is None else str(row["faces"]), row["meaning"]]

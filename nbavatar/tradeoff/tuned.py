@@ -6,7 +6,7 @@ that are absent, and everything when no billboard is in the picture.
 
 import contextlib
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -14,10 +14,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from nbavatar.avatar.base import Stages, compose
 from nbavatar.avatar.billboards import Posed
-from nbavatar.avatar.model import Avatar, compose
+from nbavatar.avatar.model import Avatar
 from nbavatar.avatar.region import Region, full_region, paste, region_of, shift_camera, visible_box
 from nbavatar.avatar.unet import UNet
+from nbavatar.config.core import to_mapping
 from nbavatar.config.tradeoff import SettingConfig
 from nbavatar.errors import DataError
 from nbavatar.raster.functional import render_billboards
@@ -35,7 +37,9 @@ _MIP_SHARE = 0.9  # of the billboards whose texels must not be larger than a pix
 class Laps(Protocol):
     """Told at the end of every stage of a picture: pose, raster, renderer, compose."""
 
-    def __call__(self, stage: str) -> None: ...
+    def __call__(self, stage: str) -> None:
+        """Takes the name of the stage that has just ended."""
+        ...
 
 
 @dataclass
@@ -75,6 +79,9 @@ class TunedAvatar:
         importance: contribution of every billboard to some views (`nbavatar.tradeoff.contribution`), float (N, F);
             needed only where the setting keeps a share of the billboards.
 
+    It stands in for the avatar where pictures are rendered and timed (`MeshAvatar`): faces and parts are those of the
+    whole avatar, so that meshes are checked against it.
+
     Attributes:
         avatar: with the billboards and textures that the setting keeps.
         work: counted over all pictures so far.
@@ -84,7 +91,7 @@ class TunedAvatar:
         if not isinstance(avatar, Avatar):
             found = getattr(avatar, "method", type(avatar).__name__)
             raise DataError.of("setting", expected="an avatar of billboards", found=f"method {found}")
-        self.setting, self.work = setting, Work()
+        self.setting, self.work, self._whole = setting, Work(), avatar
         if setting.billboards < 1.0:
             if importance is None:
                 raise DataError.of("setting", "billboards", expected="contributions to choose by", found="none")
@@ -98,8 +105,91 @@ class TunedAvatar:
 
     @property
     def parts(self) -> list[str]:
-        """Parts that have billboards left."""
-        return self.avatar.parts
+        """Parts of the whole avatar."""
+        return self._whole.parts
+
+    @property
+    def face_counts(self) -> dict[str, int]:
+        """Faces of each part of the whole avatar."""
+        return self._whole.face_counts
+
+    @property
+    def vertex_counts(self) -> dict[str, int]:
+        """Vertices of each part."""
+        return self._whole.vertex_counts
+
+    @property
+    def faces(self) -> Tensor:
+        """Faces of the whole avatar, int64 (F, 3)."""
+        return self._whole.faces
+
+    def part_faces(self) -> dict[str, Tensor]:
+        """Faces of each part in its own vertex numbers, int64 (F, 3)."""
+        return self._whole.part_faces()
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Provenance of the whole avatar."""
+        return self._whole.record
+
+    @property
+    def method(self) -> str:
+        """Kind of the avatar."""
+        return self._whole.method
+
+    @property
+    def primitives(self) -> int:
+        """Billboards that are kept."""
+        return self.avatar.primitives
+
+    def eval(self) -> "TunedAvatar":
+        """Itself: it is never trained."""
+        return self
+
+    def facts(self, width: int, height: int) -> dict[str, Any]:
+        """As the avatar's, and the setting."""
+        return self.avatar.facts(width, height) | {"setting": to_mapping(self.setting)}
+
+    def stages(
+        self,
+        verts: Mapping[str, Tensor],
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        background: Tensor,
+        *_: Any,
+    ) -> Stages:
+        """Stages of one view to time; arguments as in `render`."""
+        s, size = self.setting, (width, height)
+        calls: dict[str, Callable[[], Any]] = {
+            f"total_{s.precision}": lambda: self.render(verts, viewmat, K, width, height, background)[0]
+        }
+        with torch.no_grad(), _threads(s.threads):
+            scene = self._scene(verts)
+            small, inner = self._inner(K, width, height)
+            posed = None if scene is None else scene.avatar.pose(verts)[0]
+            if scene is None or posed is None or visible_box(posed, viewmat, inner, *small) is None:
+                return Stages(calls, 0.0)
+            region = self._region(scene, posed, viewmat, inner, *small)
+            features, nb_alpha = self._raster(scene, posed, viewmat, inner, region)
+            colour, alpha = self._decode(features, nb_alpha)
+        own: dict[str, Callable[[], Any]] = {
+            "pose": lambda: scene.avatar.pose(verts),
+            "raster": lambda: self._raster(scene, posed, viewmat, inner, region),
+            f"renderer_{s.precision}": lambda: self._decode(features, nb_alpha),
+            "compose": lambda: self._finish(colour, alpha, nb_alpha, region, small, size, background),
+        }
+
+        def timed(call: Callable[[], Any]) -> Callable[[], Any]:
+            def run() -> Any:
+                with torch.no_grad(), _threads(s.threads):
+                    return call()
+
+            return run
+
+        window = region.width * region.height / (small[0] * small[1])
+        return Stages({name: timed(call) for name, call in own.items()} | calls, window)
 
     def render(
         self,
@@ -127,8 +217,7 @@ class TunedAvatar:
         with torch.no_grad(), _threads(s.threads):
             self.work.pictures += 1
             scene = self._scene(verts)
-            small = max(1, round(s.resolution * width)), max(1, round(s.resolution * height))
-            inner = K * K.new_tensor([small[0] / width, small[1] / height, 1.0])[:, None]
+            small, inner = self._inner(K, width, height)
             posed, box = None, None
             if scene is not None:
                 posed, _ = scene.avatar.pose(verts, frame)
@@ -148,6 +237,12 @@ class TunedAvatar:
             result = self._finish(colour, alpha, nb_alpha, region, small, (width, height), background)
             _lap(laps, "compose")
         return result
+
+    def _inner(self, K: Tensor, width: int, height: int) -> tuple[tuple[int, int], Tensor]:
+        """Size [px] and intrinsics of the picture that is rendered, before it is enlarged."""
+        share = self.setting.resolution
+        small = max(1, round(share * width)), max(1, round(share * height))
+        return small, K * K.new_tensor([small[0] / width, small[1] / height, 1.0])[:, None]
 
     def _scene(self, verts: Mapping[str, Tensor]) -> _Scene | None:
         present = tuple(p for p in self.avatar.parts if p in verts and bool(torch.isfinite(verts[p]).all()))
@@ -170,9 +265,7 @@ class TunedAvatar:
         margin = a.roi_margin if s.roi_margin is None else s.roi_margin
         return region_of(posed, viewmat, K, width, height, multiple=multiple, margin=margin)
 
-    def _raster(
-        self, scene: _Scene, posed: Posed, viewmat: Tensor, K: Tensor, region: Region
-    ) -> tuple[Tensor, Tensor]:
+    def _raster(self, scene: _Scene, posed: Posed, viewmat: Tensor, K: Tensor, region: Region) -> tuple[Tensor, Tensor]:
         s = self.setting
         features, alpha = scene.levels[0]
         if len(scene.levels) > 1:

@@ -33,11 +33,7 @@ def test_the_front_is_what_no_other_point_beats(pairs: list[tuple[int, int]]) ->
     costs, gains = [float(c) for c, _ in pairs], [float(g) for _, g in pairs]
     front = pareto_front(costs, gains)
     # Brute force, by the definition, over values (equal points count once).
-    beaten = {
-        i
-        for i, (c, g) in enumerate(pairs)
-        if any(a <= c and b >= g and (a, b) != (c, g) for a, b in pairs)
-    }
+    beaten = {i for i, (c, g) in enumerate(pairs) if any(a <= c and b >= g and (a, b) != (c, g) for a, b in pairs)}
     assert {pairs[i] for i in front} == {p for i, p in enumerate(pairs) if i not in beaten}
     assert len({pairs[i] for i in front}) == len(front)
     assert [costs[i] for i in front] == sorted(costs[i] for i in front)

@@ -1,0 +1,136 @@
+"""`nbavatar tradeoff` on a toy scene, and what render, speed and train make of its presets."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from nbavatar.cli import main as cli
+from nbavatar.cli import tradeoff
+from nbavatar.config.avatar import TrainConfig
+from nbavatar.io.framepack import FramePack
+from nbavatar.io.records import read_json
+from tests.scenes.toy import SIZE, write_scene
+
+SHEET = {
+    "exact": {"roi": False},
+    "knobs": {"roi": [True], "order": ["center"], "decode": [0.5], "billboards": [0.5]},
+    "presets": {"balanced": {"psnr": 0.1, "lpips": 0.002}, "fast": {"psnr": 60.0, "lpips": 9.0}},
+    "images": 2,
+    "repeats": 2,
+    "warmup": 0,
+    "importance_views": 2,
+}
+
+
+def sweep(*words: str) -> int:
+    """`nbavatar tradeoff`, whatever the table of verbs says."""
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    tradeoff.add_arguments(parser)
+    return tradeoff.main(parser.parse_args(list(words)))
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory) -> dict:
+    """A toy avatar and its sweep."""
+    folder = tmp_path_factory.mktemp("tradeoff")
+    scene = write_scene(folder / "scene", size=64)
+    cfg = {
+        "steps": 2, "texels": 4, "weight_lpips": 0.0, "previews": 0,
+        "unet": {"width": 4, "depth": 2, "max_width": 8, "convs": 1},
+    }  # fmt: skip
+    model, packs = str(folder / "full" / "model.pt"), [str(path) for path in scene["packs"]]
+    common = ["--meshes", str(scene["meshes"]), "--device", "cpu"]
+    train = ["train", "--frames", *packs[:2], *common, "--spectral", str(scene["spectral"]), "--out", model]
+    assert cli([*train, "--cfg", json.dumps(cfg)]) == 0
+    words = ["--model", model, *common, "--frames", packs[2], "--train-frames", *packs[:2]]
+    words += ["--sheet", json.dumps(SHEET), "--out", str(folder / "out")]
+    assert sweep(*words) == 0
+    return {"folder": folder, "model": model, "packs": packs, "common": common, "words": words, "scene": scene}
+
+
+def test_a_sweep_writes_a_row_a_point_and_all_its_files(measured, capsys) -> None:
+    out = measured["folder"] / "out"
+    rows = list(csv.DictReader((out / "points.csv").open()))
+    assert {"exact", "roi=on", "order=center", "decode=0.5", "billboards=0.5"} <= {row["label"] for row in rows}
+    exact = rows[0]
+    assert exact["label"] == "exact" and float(exact["speedup"]) == 1 and float(exact["diff_max"]) == 0
+    for row in rows:
+        assert float(row["total_ms"]) > 0 and float(row["peak_memory_mb"]) > 0 and 0 <= float(row["diff_share"]) <= 1
+        assert float(row["psnr_lost"]) == pytest.approx(float(exact["psnr"]) - float(row["psnr"]), abs=1e-9)
+    half = next(row for row in rows if row["label"] == "decode=0.5")
+    assert float(half["decoded_pixels"]) == float(exact["decoded_pixels"]) / 4
+    assert float(next(r for r in rows if r["label"] == "billboards=0.5")["posed"]) == 6
+    for name in ("front_ms", "front_memory", "front_bytes"):
+        assert (out / f"{name}.png").stat().st_size > 5000 and (out / f"{name}.pdf").read_bytes()[:4] == b"%PDF"
+    assert "`order`" in (out / "knobs.md").read_text() and read_json(out / "tradeoff.json")["complete"] is True
+    before = (out / "points.jsonl").read_text()
+    assert sweep(*measured["words"]) == 0
+    assert "0 points measured" in capsys.readouterr().out and (out / "points.jsonl").read_text() == before
+
+
+def test_render_and_speed_take_presets_and_budgets(measured, tmp_path, capsys) -> None:
+    model, out = measured["model"], str(tmp_path / "r.zip")
+    render = ["render", "--model", model, "--frames", measured["packs"][2], *measured["common"], "--out", out]
+    protocol = json.dumps({"name": "nv", "split": "novel_view", "roi": False})
+    pictures = {}
+    for words in (["--preset", "accurate"], [], ["--preset", "fast"], ["--max-ms", "1e9"], ["--min-psnr", "0"]):
+        assert cli([*render, "--protocol", protocol, *words]) == 0
+        with FramePack(out) as pack:
+            pictures[" ".join(words)] = pack.read("rgb", pack.frames[0]).tobytes()
+            assert ("tuned" in pack.manifest["record"]) == bool(words)
+    assert pictures["--preset accurate"] == pictures[""]
+    by_protocol = json.dumps({"name": "nv", "split": "novel_view", "preset": "fast"})
+    assert cli([*render, "--protocol", by_protocol]) == 0
+    with FramePack(out) as pack:
+        assert pack.read("rgb", pack.frames[0]).tobytes() == pictures["--preset fast"]
+    assert cli([*render, "--max-ms", "1e-6"]) == 2
+    assert "--max-ms: expected a measured setting" in capsys.readouterr().err
+    assert cli([*render, "--preset", "fats"]) == 2
+    assert "did you mean 'fast'" in capsys.readouterr().err
+    small = write_scene(tmp_path / "small", size=SIZE)
+    other = ["render", "--model", model, "--frames", str(small["packs"][2]), *measured["common"], "--out", out]
+    assert cli([*other, "--max-ms", "100"]) == 2
+    assert "run `nbavatar tradeoff`" in capsys.readouterr().err
+    timing = ["speed", "--model", model, "--frames", measured["packs"][2], *measured["common"]]
+    timing += ["--out", str(tmp_path / "speed.json"), "--cfg", json.dumps({"frames": 1, "repeats": 2, "warmup": 0})]
+    assert cli([*timing, "--preset", "fast"]) == 0
+    record = read_json(tmp_path / "speed.json")["speed"]
+    assert record["tuned"]["preset"] == "fast" and {"pose", "raster", "compose"} < set(record["ms"])
+
+
+def test_presets_of_another_training_are_refused(measured, tmp_path, capsys) -> None:
+    moved = tmp_path / "model.pt"
+    moved.write_bytes(Path(measured["model"]).read_bytes() + b"\0")
+    (tmp_path / "presets.json").write_bytes(Path(measured["model"]).with_name("presets.json").read_bytes())
+    words = ["render", "--model", str(moved), "--frames", measured["packs"][2], *measured["common"]]
+    assert cli([*words, "--out", str(tmp_path / "r.zip"), "--preset", "fast"]) == 2
+    assert "run `nbavatar tradeoff` again" in capsys.readouterr().err
+
+
+def test_training_takes_order_and_window_from_a_preset(tmp_path) -> None:
+    from nbavatar.cli.common import training_preset
+
+    setting = {"order": "center", "roi": False, "precision": "bf16", "texels": 2}
+    entry = {"device": "x", "size": [1, 1], "presets": {"fast": {"setting": setting, "label": "", "why": ""}}}
+    content = {"kind": "nbavatar presets", "format": 1, "model": "m", "measured": [entry | {"importance": None}]}
+    (tmp_path / "presets.json").write_text(json.dumps(content))
+    config = training_preset("fast", str(tmp_path / "presets.json"), TrainConfig(texels=8))
+    assert (config.order, config.roi, config.precision) == ("center", False, "bf16")
+    assert config.texels == 8 and config.roi_margin == TrainConfig().roi_margin
+
+
+def test_savings_are_measured_on_and_off(measured) -> None:
+    assert sweep(*measured["words"], "--savings") == 0
+    rows = read_json(measured["folder"] / "out" / "savings.json")["rows"]
+    by_name = {(row["saving"], row["scene"]): row for row in rows}
+    window = by_name["region of interest", "avatar 8x smaller"]
+    assert window["on_decoded_pixels"] < window["off_decoded_pixels"] == 64 * 64
+    empty = by_name["empty pictures skipped", "avatar behind the camera"]
+    assert empty["on_raster_calls"] == empty["on_decoder_calls"] == 0 < empty["off_decoder_calls"]
+    head = by_name["absent parts left out", "head only"]
+    assert (head["on_posed"], head["off_posed"]) == (8, 12) and head["diff_share"] == 0
+    assert all(row["on_ms"] > 0 and row["off_ms"] > 0 for row in rows)
