@@ -83,6 +83,7 @@ def main(args: argparse.Namespace) -> int:
             "protocol": to_mapping(protocol),
             "protocol_hash": protocol_hash(protocol, cfg),
             "cameras": sorted(truths),
+            "training": _training(made.get("training") or {}),
             "train_cameras": [pack.manifest["camera"] for pack in training.values()],
             **result,
             "record": record,
@@ -141,6 +142,20 @@ def _evaluate(
         device=device,
     )
     return result | {"frames": frames_digest(render.frames)}
+
+
+def _training(record: dict[str, Any]) -> dict[str, Any]:
+    """What a table says of how a render's avatar was trained; empty where the render does not know."""
+    config = record.get("config") or {}
+    method = record.get("method") or config.get("method")
+    kept = {
+        "method": method,
+        "mode": (config.get(method) or {}).get("mode") if method else None,
+        "steps": record.get("steps"),
+        "train_seconds": record.get("train_seconds", record.get("seconds")),
+        **{key: record.get(key) for key in ("primitives", "model_bytes", "peak_memory_mb")},
+    }
+    return {key: value for key, value in kept.items() if value is not None}
 
 
 def _by_camera(packs: list[FramePack]) -> dict[str, FramePack]:

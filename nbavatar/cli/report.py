@@ -6,7 +6,10 @@
     --frames     frame packs of `nbavatar crop`: the truth beside them
     --histories  training histories (.jsonl), one a trained avatar, in <subject>/<variant>/; previews in
                  model.pt.state/previews beside them are shown where they exist
-    --pictures   further pictures (.png), such as those of the refit and the contact stage
+    --speeds     results of `nbavatar speed`, in <subject>/<variant>.json: with the evaluations, quality against cost
+    --pictures   further pictures (.png): of the refit and the contact stage, and results of `nbavatar figure`, whose
+                 titles and captions (.json beside them) are shown
+    --videos     results of `nbavatar video` (.mp4): played in the page up to `video_mb`, linked beyond
     --figures    folder for <subject>_<protocol>_<n>.png and .pdf, training.png and .pdf: the same for print
     --out        index.html; needs no network and no other file
 
@@ -14,7 +17,9 @@ Every part may be left out; what is not given is not shown.
 """
 
 import argparse
+import base64
 import json
+import os
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -30,10 +35,12 @@ from nbavatar.reporting.comparison import ROWS, Comparison, Rendered, compare_fr
 from nbavatar.reporting.page import (
     curves_section,
     page,
+    pareto_section,
     pictures_section,
     provenance_section,
     strips_section,
     tables_section,
+    videos_section,
 )
 from nbavatar.reporting.pictures import ERROR_MAX, data_uri, reduce_picture
 
@@ -50,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("--frames", "ZIP", "ground-truth crops"),
         ("--histories", "JSONL", "training histories"),
         ("--pictures", "PNG", "further pictures"),
+        ("--videos", "MP4", "videos"),
     ):
         parser.add_argument(name, nargs="*", default=[], metavar=kind, help=text)
     parser.add_argument(
@@ -76,11 +84,16 @@ def main(args: argparse.Namespace) -> int:
     histories = read_histories(args.histories)
     if args.figures:
         _write_figures(Path(args.figures), comparisons, histories)
+    pictures = [(_is_figure(path), _picture(path, cfg)) for path in args.pictures]
+    measured = [(Path(path).stem, content) for path, content in speeds]
     sections = [
         ("tables", "Tables", tables_section(_tables(args.tables))),
+        ("pareto", "Quality against cost", pareto_section([content for _, content in evals], measured)),
         ("pictures", "Comparison with the truth", strips_section(strips) if strips else ""),
+        ("figures", "Figures", pictures_section([picture for figure, picture in pictures if figure])),
+        ("videos", "Videos", videos_section([_video(path, args.out, cfg) for path in args.videos])),
         ("training", "Training", _training(args.histories, histories, cfg)),
-        ("stages", "Geometry", pictures_section([_picture(path, cfg) for path in args.pictures])),
+        ("stages", "Geometry", pictures_section([picture for figure, picture in pictures if not figure])),
         ("provenance", "Provenance", provenance_section([*evals, *speeds]) if evals or speeds else ""),
     ]
     with atomic_write(args.out) as path:
@@ -171,9 +184,31 @@ def _training(paths: list[str], histories: dict[str, list[dict[str, Any]]], cfg:
     return curves_section(histories) + shown
 
 
+def _is_figure(name: str) -> bool:
+    return Path(name).with_suffix(".json").is_file()
+
+
 def _picture(name: str, cfg: ReportConfig) -> tuple[str, str, str]:
     """Title, embedded picture and alternative text; contact sheets keep three times the side of single pictures."""
     path = Path(name)
     title = " ".join(part for part in path.parts[-3:-1] if part not in ("", "/")) + f" {path.stem}"
+    text = f"Picture of the stage {title}"
+    if _is_figure(name):
+        said = read_json(path.with_suffix(".json"))
+        title = ". ".join(part.rstrip(".") for part in (said.get("title"), said.get("caption")) if part) or path.stem
+        text = f"{title}: {', '.join(said.get('shown', [])) or 'nothing yet'}"
     picture = reduce_picture(decode_image(path), 3 * cfg.max_side)
-    return title, data_uri(picture), f"Picture of the stage {title}"
+    return title, data_uri(picture), text
+
+
+def _video(name: str, page_path: str, cfg: ReportConfig) -> tuple[str, str, bool]:
+    """Title, address, and whether the address holds the video itself (or leads to the file)."""
+    path = Path(name)
+    title = " ".join(part for part in path.parts[-3:-1] if part not in ("", "/")) + f" {path.stem}"
+    try:
+        size = path.stat().st_size
+    except FileNotFoundError as error:
+        raise DataError.of(name, expected="a video (.mp4)", found="no such file") from error
+    if size > cfg.video_mb * 1e6:
+        return title, os.path.relpath(path, Path(page_path).parent).replace(os.sep, "/"), False
+    return title, "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode("ascii"), True

@@ -7,9 +7,12 @@ from pathlib import Path
 from nbavatar.config.core import from_mapping, option
 from nbavatar.errors import ConfigError, did_you_mean
 
-__all__ = ["Panel", "TableLayout", "TableRow", "choose_table", "read_tables"]
+__all__ = ["TIMED", "TRAINED", "Panel", "TableLayout", "TableRow", "choose_table", "read_tables"]
 
-METRICS = ("psnr", "ssim", "lpips", "psnr_fg", "ssim_fg", "fps", "ms", "train_cameras", "test_camera")
+# Columns that come from a timing, and from the record of a training.
+TIMED = ("fps", "ms", "memory_mb")
+TRAINED = ("model_mb", "primitives", "train_minutes", "train_memory_mb")
+METRICS = ("psnr", "ssim", "lpips", "psnr_fg", "ssim_fg", *TIMED, *TRAINED, "train_cameras", "test_camera")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +78,7 @@ class TableLayout:
     @property
     def speeds(self) -> tuple[str, ...]:
         """Variants whose timings the table shows."""
-        if self.kind != "speed" and "fps" not in self.columns:
+        if self.kind != "speed" and not set(TIMED) & set(self.columns):
             return ()
         return tuple(dict.fromkeys(row.variant for row in self.rows if row.variant))
 

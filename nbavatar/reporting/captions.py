@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nbavatar.config.tables import Panel, TableLayout
-from nbavatar.reporting.cells import COLUMNS, Source
+from nbavatar.reporting.cells import COLUMNS, Source, plain
 from nbavatar.reporting.printed import Printed, deviating_marks, deviating_means
 
-__all__ = ["describe_deviations", "describe_protocol", "describe_speeds"]
+__all__ = ["describe_deviations", "describe_protocol", "describe_speeds", "describe_trainings"]
 
 _SPLITS = {
     "novel_view": "training frames in the held-out camera",
@@ -66,10 +66,28 @@ def describe_speeds(panel: Panel, results: Sequence[tuple[Mapping[str, Any], Sou
     seen = []
     for result, source in results:
         size = f", {source.size[0]} x {source.size[1]} px" if source.size else ""
-        count = result["speed"].get("billboards")
-        seen.append(f"{result.get('device') or 'an unknown device'}{size}" + (f", {count} billboards" if count else ""))
+        speed = result["speed"]
+        count = speed.get("primitives") or speed.get("billboards")
+        kind = "billboards" if speed.get("method", "billboards") == "billboards" else "Gaussians"
+        seen.append(f"{result.get('device') or 'an unknown device'}{size}" + (f", {count} {kind}" if count else ""))
     remark = " (the paper: 1024 x 1024 px, on an RTX 4090)" if panel.reported else ""
     return ["Timings reproduced on " + "; ".join(dict.fromkeys(seen)) + remark + "."]
+
+
+def describe_trainings(layout: TableLayout, results: Sequence[tuple[Mapping[str, Any], Source]]) -> list[str]:
+    """One sentence with the method, mode and budget of every row, where its renders say so."""
+    words = []
+    for row in layout.rows:
+        found = [r["training"] for r, _ in results if r["variant"] == row.variant and r.get("training")]
+        if not row.variant or not found:
+            continue
+        first = found[0]
+        method = str(first.get("method") or "billboards").replace("_", " ")
+        mode = f", mode {first['mode']}" if first.get("mode") else ""
+        steps = sorted({int(training["steps"]) for training in found if training.get("steps") is not None})
+        budget = f", {' to '.join(f'{n:,}' for n in dict.fromkeys((steps[0], steps[-1])))} steps" if steps else ""
+        words.append(f"{plain(row.label)}: {method}{mode}{budget}")
+    return [f"Trained here: {'; '.join(dict.fromkeys(words))}."] if words else []
 
 
 def describe_deviations(

@@ -1,10 +1,11 @@
 """Cells of a table: shown text, exact value, and where each number comes from."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["COLUMNS", "MISSING", "Block", "Cell", "ColumnStyle", "PanelTable", "Source", "Table", "TableLine"]
+__all__ = ["COLUMNS", "MISSING", "Block", "Cell", "ColumnStyle", "PanelTable", "Source", "Table", "TableLine", "plain"]
 
 MISSING = "—"
 
@@ -26,6 +27,11 @@ COLUMNS: Mapping[str, ColumnStyle] = {
     "ssim_fg": ColumnStyle("SSIM (foreground)", 3, True),
     "fps": ColumnStyle("FPS", 0, True),
     "ms": ColumnStyle("Speed (ms)", 1, False),
+    "memory_mb": ColumnStyle("Memory (MB)", 0, False),
+    "model_mb": ColumnStyle("Model (MB)", 1, False),
+    "primitives": ColumnStyle("Primitives", 0, None),
+    "train_minutes": ColumnStyle("Training (min)", 1, False),
+    "train_memory_mb": ColumnStyle("Training memory (MB)", 0, False),
     "train_cameras": ColumnStyle("Training Cameras", 0, None),
     "test_camera": ColumnStyle("Evaluation Cameras", 0, None),
 }
@@ -106,3 +112,8 @@ class Table:
     notes: Sequence[str]
     panels: Sequence[PanelTable]
     record: Mapping[str, Any] = field(default_factory=dict)
+
+
+def plain(label: str) -> str:
+    """A label without LaTeX: ``w/o $\\mathcal{L}_{NB}$`` becomes ``w/o L_NB``."""
+    return re.sub(r"\\mathcal\{(\w+)\}|_\{(\w+)\}", lambda m: m.group(1) or f"_{m.group(2)}", label).replace("$", "")

@@ -11,9 +11,9 @@ import io
 import json
 import re
 
-from nbavatar.reporting.cells import COLUMNS, Cell, PanelTable, Table
+from nbavatar.reporting.cells import COLUMNS, Cell, PanelTable, Table, plain
 
-__all__ = ["plain", "to_csv", "to_latex", "to_markdown"]
+__all__ = ["to_csv", "to_latex", "to_markdown"]
 
 _CSV = (
     "table", "panel", "block", "row", "column", "text", "value", "mark", "comparable", "shown", "source", "digest",
@@ -200,8 +200,3 @@ def _sources(table: Table) -> list[tuple[str, str]]:
         for source in cell.sources
     }
     return list(found)
-
-
-def plain(label: str) -> str:
-    """A label without LaTeX: ``w/o $\\mathcal{L}_{NB}$`` becomes ``w/o L_NB``."""
-    return re.sub(r"\\mathcal\{(\w+)\}|_\{(\w+)\}", lambda m: m.group(1) or f"_{m.group(2)}", label).replace("$", "")

@@ -10,7 +10,6 @@ from nbavatar.config.figures import FigureLayout
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.io.framepack import FramePack
 from nbavatar.reporting.comparison import Comparison, Rendered, compare_frame, frames_in_contact
-from nbavatar.reporting.contact import best_camera, deepest_frames, dent_pictures, dent_scale
 from nbavatar.reporting.curves import training_curves
 from nbavatar.reporting.figures import curves_figure
 from nbavatar.reporting.grids import GridRow, grid_figure
@@ -107,6 +106,9 @@ def comparison_drawn(renders: Sequence[Rendered], crops: Sequence[FramePack], la
 
 def contact_drawn(sequences: Mapping[str, MeshSequence], crops: Sequence[FramePack], frames: int) -> Drawn:
     """Photo, meshes before and after the contact stage and the displacement, with a zoom at the deepest dent below."""
+    # Meshes are drawn by Numba kernels, which the other figures need not load.
+    from nbavatar.reporting.contact import best_camera, deepest_frames, dent_scale
+
     chosen = []
     for subject, sequence in sequences.items():
         own = [crop for crop in crops if crop.manifest["subject"] == subject]
@@ -140,6 +142,8 @@ def contact_drawn(sequences: Mapping[str, MeshSequence], crops: Sequence[FramePa
 def _drawn_at(
     sequence: MeshSequence, frame: str, K: np.ndarray, camera: np.ndarray, size: tuple[int, int], scale: float
 ) -> dict[str, np.ndarray]:
+    from nbavatar.reporting.contact import dent_pictures
+
     factor = max(1.0, 512 / max(size))
     scaled = np.diag([factor, factor, 1.0]) @ K
     width, height = (max(1, round(factor * side)) for side in size)

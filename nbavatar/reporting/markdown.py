@@ -68,7 +68,8 @@ def _table(lines: list[str]) -> Iterator[str]:
     for line in lines[2:]:
         cells = _cells(line)
         if len(cells) > 1 and not any(cells[1:]):
-            yield f'<tr class="block"><th colspan="{len(head)}" scope="rowgroup">{_inline(cells[0])}</th></tr>'
+            title = f"<span>{_inline(cells[0])}</span>"
+            yield f'<tr class="block"><th colspan="{len(head)}" scope="rowgroup">{title}</th></tr>'
             continue
         body = "".join(f"<td>{_inline(cell)}</td>" for cell in cells[1:])
         yield f'<tr><th scope="row">{_inline(cells[0])}</th>{body}</tr>'

@@ -1,4 +1,4 @@
-"""One self-contained HTML page: tables, comparison pictures, training curves, provenance. Text in, text out.
+"""One self-contained HTML page: tables, pictures, videos, plots, provenance. Text in, text out.
 
 Nothing is fetched: styles, script and pictures are inside. Without JavaScript everything but the sliders works. Colours
 follow the reader's light or dark setting; strips and tables scroll inside the page on narrow screens.
@@ -15,10 +15,11 @@ from typing import Any
 
 from nbavatar.reporting.curves import line_chart, training_curves
 from nbavatar.reporting.markdown import markdown_to_html
+from nbavatar.reporting.pareto import COSTS, QUALITIES, measured_variants, scatter_chart
 from nbavatar.reporting.pictures import ERROR_MAX, RAMP
 
 __all__ = ["Card", "Strip", "curves_section", "page", "pictures_section", "provenance_section", "strips_section"]
-__all__ += ["tables_section"]
+__all__ += ["pareto_section", "tables_section", "videos_section"]
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,43 @@ def curves_section(histories: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     if not charts:
         return "<p>No training history was given.</p>"
     return '<div class="charts">\n' + "\n".join(f"<div>{chart}</div>" for chart in charts) + "\n</div>"
+
+
+def pareto_section(evals: Sequence[Mapping[str, Any]], speeds: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
+    """Quality against time, memory and bytes, protocol by protocol; empty without a variant that has both.
+
+    Args:
+        evals: results of ``nbavatar evaluate``.
+        speeds: (variant, result of ``nbavatar speed``).
+    """
+    parts = []
+    for protocol in dict.fromkeys(str(result["protocol"]["name"]) for result in evals):
+        measured = measured_variants(evals, speeds, protocol)
+        charts = [scatter_chart(measured, cost, quality) for quality in QUALITIES for cost in COSTS]
+        charts = [chart for chart in charts if chart]
+        if charts and len(measured) > 1:
+            devices = sorted({str(result.get("device", "")) for _, result in speeds} - {""})
+            parts.append(f"<h3>{html.escape(protocol)}</h3>")
+            parts.append(
+                f"<p>Timed on {html.escape('; '.join(devices) or 'a device that is not named')}. The line joins the "
+                "variants that no other beats in both.</p>"
+            )
+            parts.append('<div class="charts">\n' + "\n".join(f"<div>{chart}</div>" for chart in charts) + "\n</div>")
+    return "\n".join(parts)
+
+
+def videos_section(videos: Sequence[tuple[str, str, bool]]) -> str:
+    """Videos: (title, address, whether it can be played from the page)."""
+    parts = []
+    for title, address, embedded in videos:
+        text = html.escape(title)
+        if embedded:
+            player = "<video controls loop muted playsinline preload=metadata"
+            player += f' src="{address}" aria-label="{_safe(title)}"></video>'
+            parts.append(f"<figure>{player}<figcaption>{text}</figcaption></figure>")
+        else:
+            parts.append(f'<p><a href="{_safe(address)}">{text}</a> (a file beside this page)</p>')
+    return '<div class="videos">\n' + "\n".join(parts) + "\n</div>" if parts else ""
 
 
 def pictures_section(pictures: Sequence[tuple[str, str, str]]) -> str:

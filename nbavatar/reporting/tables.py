@@ -12,9 +12,14 @@ from dataclasses import replace
 from decimal import Decimal
 from typing import Any
 
-from nbavatar.config.tables import Panel, TableLayout, TableRow
+from nbavatar.config.tables import TIMED, TRAINED, Panel, TableLayout, TableRow
 from nbavatar.errors import DataError
-from nbavatar.reporting.captions import describe_deviations, describe_protocol, describe_speeds
+from nbavatar.reporting.captions import (
+    describe_deviations,
+    describe_protocol,
+    describe_speeds,
+    describe_trainings,
+)
 from nbavatar.reporting.cells import COLUMNS, MISSING, Block, Cell, PanelTable, Source, Table, TableLine
 from nbavatar.reporting.printed import Printed
 from nbavatar.reporting.ranks import rank_marks
@@ -101,6 +106,7 @@ def build_table(
             notes.extend(describe_speeds(panel, [results[k] for k in results if k[2] == "" and k[1] in layout.speeds]))
         if layout.kind in ("subjects", "mean", "subject"):
             notes.extend(describe_protocol(panel, used, lpips_net))
+            notes.extend(describe_trainings(layout, used))
     return Table(name, layout.title, layout.head, layout.label, _caption(layout), tuple(dict.fromkeys(notes)), panels)
 
 
@@ -203,12 +209,14 @@ def _reproduced_cell(
     subject, _, metric = column.rpartition(".")
     if layout.kind == "cameras":
         return _camera_cell(results.get((row.stage, row.variant, panel.protocol)), metric)
-    if layout.kind == "speed" or metric in ("fps", "ms"):
+    if layout.kind == "speed" or metric in TIMED:
         stage = row.stage or "total_fp32"
         timings = [value for key, value in results.items() if key[1] == row.variant and key[2] == ""]
         if layout.kind == "subject":
             timings = [value for value in timings if value[0]["subject"] == layout.subjects[0]] or timings
         return _speed_cell(timings[0], stage, metric) if timings else None
+    if metric in TRAINED:
+        return _trained_cell(results.get((subject, row.variant, panel.protocol)), metric)
     if subject == "mean":
         return _mean_cell(layout, panel, row, metric, results, lpips_net)
     result = results.get((subject, row.variant, panel.protocol))
@@ -238,6 +246,9 @@ def _mean_cell(
 
 def _speed_cell(result: Result, stage: str, column: str) -> Cell | None:
     """One timing; the stage ``renderer_half`` is fp16 where it was timed, else bf16."""
+    if column == "memory_mb":
+        memory = result[0]["speed"].get("peak_memory_mb")
+        return Cell(_text(column, float(memory)), float(memory), sources=(result[1],)) if memory else None
     times = result[0]["speed"]["ms"]
     names = [stage.replace("half", precision) for precision in ("fp16", "bf16")] if stage.endswith("half") else [stage]
     name = next((name for name in names if times.get(name)), None)
@@ -245,6 +256,21 @@ def _speed_cell(result: Result, stage: str, column: str) -> Cell | None:
         return None
     value = float(times[name]) if column == "ms" else 1000.0 / float(times[name])
     return Cell(_text(column, value), value, sources=(result[1],), note=name)
+
+
+def _trained_cell(result: Result | None, column: str) -> Cell | None:
+    """What a training cost, from the record that its renders carry."""
+    training = (result[0].get("training") or {}) if result is not None else {}
+    key, unit = {
+        "model_mb": ("model_bytes", 1e6),
+        "primitives": ("primitives", 1.0),
+        "train_minutes": ("train_seconds", 60.0),
+        "train_memory_mb": ("peak_memory_mb", 1.0),
+    }[column]
+    if result is None or training.get(key) is None:
+        return None
+    value = float(training[key]) / unit
+    return Cell(_text(column, value), value, sources=(result[1],))
 
 
 def _camera_cell(result: Result | None, column: str) -> Cell | None:

@@ -48,3 +48,26 @@ def browse(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[str,
         return done.stdout, console
 
     return run
+
+
+@pytest.fixture(scope="session")
+def latex(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], str]:
+    """``latex(document)`` -> the log of pdflatex, which must end without an error.
+
+    Skips where no pdflatex is installed (Debian: apt-get install texlive-latex-recommended); this is the only place
+    that does. What can be checked without it, is.
+    """
+    program = shutil.which("pdflatex")
+    if program is None:
+        pytest.skip("no pdflatex found")
+    folder = tmp_path_factory.mktemp("latex")
+
+    def run(document: str) -> str:
+        (folder / "document.tex").write_text(document, encoding="utf-8")
+        command = [program, "-interaction=nonstopmode", "-halt-on-error", "document.tex"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, timeout=120, check=False)
+        log = (folder / "document.log").read_text(encoding="latin-1")
+        assert done.returncode == 0, log[-2000:]
+        return log
+
+    return run

@@ -67,7 +67,7 @@ def run(tmp_path):
     """A small run: two variants, two cameras, tables, histories, one further picture."""
     frames = [f"{i:04}" for i in range(6)]
     crops = [write_pack(tmp_path / f"crop/{c}.zip", "S2", c, frames, ("rgb", "alpha")) for c in ("102", "108")]
-    renders, evals, histories = [], [], []
+    renders, evals, histories, speeds = [], [], [], []
     for variant in ("full", "no_nb"):
         names = [f"102/{f}" for f in frames]
         path = tmp_path / f"render/S2/{variant}/nv1024.zip"
@@ -76,8 +76,13 @@ def run(tmp_path):
         evals.append(str(tmp_path / f"{variant}.json"))
         rows = [{"camera": "102", "frame": f, "psnr": 20.5, "ssim": 0.9, "lpips_vgg": 0.1} for f in frames]
         content = {"subject": "S2", "variant": variant, "protocol": {"name": "nv1024"}, "per_image": rows, "count": 6}
+        content["metrics"] = {"psnr": 20.5 + len(renders), "ssim": 0.9, "lpips_vgg": None}
         content |= {"protocol_hash": "abcdef012345", "record": {"code": "c0de", "device": "cpu: x", "config": {"a": 1}}}
         Path(evals[-1]).write_text(json.dumps(content))
+        speed = {"ms": {"total_fp32": 10.0 * len(renders)}, "peak_memory_mb": 100.0, "model_mb": 1.5}
+        speeds.append(str(tmp_path / f"speed/S2/{variant}.json"))
+        Path(speeds[-1]).parent.mkdir(parents=True, exist_ok=True)
+        Path(speeds[-1]).write_text(json.dumps({"device": "cpu: test", "speed": speed}))
         histories.append(str(tmp_path / f"train/S2/{variant}/history.jsonl"))
         Path(histories[-1]).parent.mkdir(parents=True)
         lines = [{"step": s, "mse": 1 / (1 + s), "psnr": 10 + s / 10, "progress": s / 50} for s in range(50)]
@@ -90,10 +95,15 @@ def run(tmp_path):
     )
     (tmp_path / "ablation.csv").write_text("table\nablation\n")
     (tmp_path / "S2.png").write_bytes(encode_png(np.full((9, 9, 3), 200, np.uint8)))
+    (tmp_path / "novel_view.png").write_bytes(encode_png(np.full((9, 9, 3), 100, np.uint8)))
+    said = {"kind": "figure", "title": "Novel views", "caption": "As <seen>.", "shown": ["S2 102/0000"]}
+    (tmp_path / "novel_view.json").write_text(json.dumps(said))
+    (tmp_path / "turntable.mp4").write_bytes(b"not looked into")
     options = {
         "--tables": [str(tmp_path / "ablation.md"), str(tmp_path / "ablation.csv")],
         "--evals": evals, "--renders": renders, "--frames": crops, "--histories": histories,
-        "--pictures": [str(tmp_path / "S2.png")],
+        "--pictures": [str(tmp_path / "S2.png"), str(tmp_path / "novel_view.png")], "--speeds": speeds,
+        "--videos": [str(tmp_path / "turntable.mp4")],
     }  # fmt: skip
     return tmp_path, options
 
@@ -111,7 +121,8 @@ def test_page_is_self_contained_and_accessible(run):
     assert all(image.get("alt") and image["src"].startswith("data:image/") for image in page.all("img"))
     identities = [attrs["id"] for _, attrs in page.tags if attrs.get("id")]
     assert len(identities) == len(set(identities))
-    assert {f"#{i}" for i in ("tables", "pictures", "training", "stages", "provenance")} == {
+    sections = ("tables", "pareto", "pictures", "figures", "videos", "training", "stages", "provenance")
+    assert {f"#{i}" for i in sections} == {
         attrs["href"] for attrs in page.all("a") if attrs["href"].startswith("#")
     }
     assert all(attrs["value"] in identities for attrs in page.all("option"))
@@ -140,6 +151,7 @@ def test_every_part_may_be_missing(run):
     Page(build(folder, {}))
 
 
+@pytest.mark.slow
 def test_figures_for_print(run):
     folder, options = run
     build(folder, options, "--figures", str(folder / "figures"), "--cfg", '{"frames": 1}')
@@ -150,8 +162,18 @@ def test_figures_for_print(run):
     shown = decode_image(first["S2_nv1024_0.png"])
     # Three columns and four rows of pictures; a truth, two renders, two error maps.
     assert shown.shape[0] > 900 and (shown < 250).any(axis=-1).mean() > 0.4
-    build(folder, options, "--figures", str(folder / "figures"), "--cfg", '{"frames": 1}')
-    assert {path.name: path.read_bytes() for path in (folder / "figures").iterdir()} == first
+
+
+def test_quality_against_cost_figures_and_videos(run):
+    folder, options = run
+    text = build(folder, options)
+    # Two variants: three costs, of which memory and bytes are equal and the better one stands alone on the front.
+    assert text.count('class="front"') == 2 * 3 and "PSNR over time of one picture" in text
+    assert "Timed on cpu: test" in text
+    assert "Novel views. As &lt;seen&gt;" in text and "S2 102/0000" in text
+    assert 'src="data:video/mp4;base64,' in text
+    linked = build(folder, options, "--cfg", '{"video_mb": 0}')
+    assert '<a href="turntable.mp4">' in linked and "<video" not in linked
 
 
 def test_same_files_give_the_same_page(run):
@@ -159,7 +181,7 @@ def test_same_files_give_the_same_page(run):
 
 
 def test_missing_file_is_one_line_and_exit_2(tmp_path, capsys):
-    for option in ("--tables", "--evals", "--renders", "--frames", "--histories", "--pictures"):
+    for option in ("--tables", "--evals", "--renders", "--frames", "--histories", "--pictures", "--videos"):
         assert main(["report", option, str(tmp_path / "nothing.png"), "--out", str(tmp_path / "i.html")]) == 2
         error = capsys.readouterr().err.strip()
         assert "nothing.png" in error and "\n" not in error

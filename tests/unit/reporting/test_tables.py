@@ -168,6 +168,56 @@ def test_channels_and_speed_take_timings(tmp_path):
     )
 
 
+def test_cost_stands_beside_quality_with_mode_and_budget_of_every_method(tmp_path):
+    spent = {
+        "steps": 1200,
+        "train_seconds": 90.0,
+        "primitives": 5000,
+        "model_bytes": 2_500_000,
+        "peak_memory_mb": 700.4,
+    }
+    paths = [
+        evaluation(tmp_path, "S2", "full", "nv1024", 1024, training={"method": "billboards", **spent}),
+        evaluation(
+            tmp_path, "S2", "splatting_avatar", "nv1024", 1024,
+            training={"method": "splatting_avatar", "mode": "paper", **spent, "steps": 30_000, "primitives": 81_234},
+        ),
+    ]  # fmt: skip
+    speed = timing(tmp_path, "S2", "full", 1024, total_fp32=12.5)
+    content = json.loads(Path(speed).read_text())
+    content["speed"]["peak_memory_mb"] = 431.2
+    Path(speed).write_text(json.dumps(content))
+    cells, markdown, latex = make(tmp_path, "cost", paths, [speed])
+    row = {
+        key[3].partition(".")[2]: cell["text"]
+        for key, cell in cells.items()
+        if key[2] == "Ours" and cell["shown"] == "yes"
+    }
+    assert row == {
+        "psnr": "25.00", "ssim": "0.950", "lpips": "0.050", "ms": "12.5", "memory_mb": "431", "model_mb": "2.5",
+        "primitives": "5000", "train_minutes": "1.5", "train_memory_mb": "700",
+    }  # fmt: skip
+    other = {key[3].partition(".")[2]: cell["text"] for key, cell in cells.items() if key[2] == "SA"}
+    assert other["primitives"] == "81234" and other["ms"] == "" and other["memory_mb"] == ""
+    assert {cell["text"] for key, cell in cells.items() if key[2] == "GA"} == {""}
+    said = "Trained here: SA: splatting avatar, mode paper, 30,000 steps; Ours: billboards, 1,200 steps."
+    assert said in markdown and said in latex
+
+
+def test_baselines_fill_the_rows_of_the_paper(tmp_path):
+    paths = [
+        evaluation(tmp_path, s, v, "nv1024", 1024, psnr=p)
+        for s in ("S1", "S2", "S3", "S4")
+        for v, p in (("splatting_avatar", 24.0), ("splatting_avatar_released", 23.0), ("gaussian_avatars", 25.0))
+    ]
+    cells, _, _ = make(tmp_path, "novel_view_1024", paths)
+    means = {key[1:3]: cell["text"] for key, cell in cells.items() if key[3] == "mean.psnr"}
+    assert means["reproduced", "SA"] == "24.00" and means["reproduced", "SA, as released"] == "23.00"
+    assert means["reproduced", "GA"] == "25.00" and means["reproduced", "Ours"] == ""
+    assert ("printed", "SA, as released") not in means and means["printed", "SA"] == "25.17"
+    assert means["difference", "SA"] == "-1.17"
+
+
 def test_cameras_are_compared_as_sets(tmp_path):
     train = ["084", "100", "102", "110", "111", "121", "122"]
     path = evaluation(tmp_path, "S2", "full", "nv1024", 1024, train_cameras=train)
@@ -224,6 +274,19 @@ def test_latex_is_balanced_and_escaped(tmp_path, table):
     assert "_" not in re.sub(r"\\label\{[^}]*\}", "", outside_math)
 
 
+@pytest.mark.slow
+def test_every_table_compiles_and_fits_the_page(tmp_path, latex):
+    paths = [
+        evaluation(tmp_path, s, v, p, 64) for s in ("S1", "S2") for v, p in (("full", "nv1024"), ("full512", "nv512"))
+    ]
+    speed = timing(tmp_path, "S2", "full", 64, total_fp32=3.0, raster=1.0)
+    bodies = [make(tmp_path, table, paths, [speed])[2] for table in (*TABLES, "cost")]
+    packages = "\\usepackage{booktabs,graphicx,subcaption}\n\\usepackage[table]{xcolor}\n"
+    text = "\n\\clearpage\n".join(bodies)
+    log = latex(f"\\documentclass{{article}}\n{packages}\\begin{{document}}\n{text}\n\\end{{document}}\n")
+    assert "Overfull \\hbox" not in log and "undefined" not in log
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -252,7 +315,7 @@ def test_two_results_for_one_cell_are_refused(tmp_path, capsys):
 
 def test_tables_start_without_torch():
     code = (
-        "import sys; import nbavatar.cli.table, nbavatar.cli.report; "
+        "import sys; import nbavatar.cli.table, nbavatar.cli.report, nbavatar.cli.figure; "
         "print(sorted({'torch', 'numba', 'scipy', 'pandas', 'matplotlib'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
