@@ -5,6 +5,7 @@
     nbavatar bench deform    contact physics, frames a second with and without contact
     nbavatar bench spectral  spectral coordinates of a head and hands
     nbavatar bench fit       multi-view refit, frames a second and millimetres
+    nbavatar bench train     one training step, part by part
 
 Times depend on the machine and on what else it does: compare figures of one run only.
 """
@@ -16,7 +17,7 @@ import sys
 
 __all__ = ["add_arguments", "main"]
 
-_KERNELS = ("raster", "splat", "deform", "spectral", "fit")
+_KERNELS = ("raster", "splat", "deform", "spectral", "fit", "train")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
