@@ -88,8 +88,8 @@ def main(args: argparse.Namespace) -> int:
     measured = [(Path(path).stem, content) for path, content in speeds]
     sections = [
         ("tables", "Tables", tables_section(_tables(args.tables))),
-        ("pareto", "Quality against cost", pareto_section([content for _, content in evals], measured)),
         ("pictures", "Comparison with the truth", strips_section(strips) if strips else ""),
+        ("pareto", "Quality against cost", pareto_section([content for _, content in evals], measured)),
         ("figures", "Figures", pictures_section([picture for figure, picture in pictures if figure])),
         ("videos", "Videos", videos_section([_video(path, args.out, cfg) for path in args.videos])),
         ("training", "Training", _training(args.histories, histories, cfg)),

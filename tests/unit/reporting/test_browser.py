@@ -9,6 +9,7 @@ from PIL import Image
 
 from nbavatar.cli import main
 from nbavatar.io.framepack import FramePackWriter
+from nbavatar.io.video import VideoWriter
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +31,9 @@ addEventListener("load", () => {
   const frames = [...document.querySelectorAll("svg")].map(s => s.getBoundingClientRect());
   const inside = r => frames.some(f => r.left >= f.left - 1 && r.right <= f.right + 1 && r.top >= f.top - 1
                                        && r.bottom <= f.bottom + 1);
+  const film = document.querySelector("video");
   const found = {
+    film: [film.videoWidth, film.videoHeight, film.error ? film.error.message : ""],
     moved: after - before, width: box.querySelector(".stack").clientWidth, changed: under.src !== first,
     alt: under.alt, broken: [...document.images].filter(i => !i.complete || i.naturalWidth === 0).length,
     images: document.images.length, page: document.documentElement.scrollWidth, window: innerWidth,
@@ -71,8 +74,22 @@ def report(tmp_path_factory):
     history.write_text("\n".join(json.dumps({"step": s, "mse": 0.1 / (s + 1), "psnr": 9 + s**0.5}) for s in range(400)))
     heads = " | ".join(f"column {i}" for i in range(16))
     (folder / "wide.md").write_text(f"## Wide\n\n| {heads} |\n|{' --- |' * 16}\n| {' | '.join(['28.63'] * 16)} |\n")
+    timings, evals = [], []
+    for i, variant in enumerate(("full", "no_nb")):
+        speed = {"ms": {"total_fp32": 10.0 + i}, "peak_memory_mb": 100.0 + i, "model_mb": 1.5}
+        timings.append(folder / "speed" / "S2" / f"{variant}.json")
+        timings[-1].parent.mkdir(parents=True, exist_ok=True)
+        timings[-1].write_text(json.dumps({"device": "cpu: test", "speed": speed}))
+        evals.append(folder / f"{variant}.json")
+        content = {"subject": "S2", "variant": variant, "protocol": {"name": "nv1024"}, "per_image": [], "count": 1}
+        evals[-1].write_text(json.dumps(content | {"metrics": {"psnr": 20.0 + i}, "record": {}}))
+    video = folder / "video" / "S2" / "full" / "turntable.mp4"
+    with VideoWriter(video, 25) as writer:
+        for shift in range(4):
+            writer.add(np.roll(picture, shift, axis=0))
     out = folder / "index.html"
     arguments = ["--renders", *renders, "--frames", str(folder / "102.zip"), "--histories", str(history)]
+    arguments += ["--evals", *map(str, evals), "--speeds", *map(str, timings), "--videos", str(video)]
     assert main(["report", "--tables", str(folder / "wide.md"), *arguments, "--out", str(out)]) == 0
     probed = folder / "probed.html"
     probed.write_text(out.read_text(encoding="utf-8").replace("</body>", PROBE + "</body>"), encoding="utf-8")
@@ -93,6 +110,7 @@ def test_pictures_load_sliders_move_and_nothing_complains(report, browse):
     assert found["moved"] == pytest.approx(0.3 * found["width"], abs=1.5)
     assert found["changed"] and found["alt"] == "no_nb (camera 102, frame f)"
     assert found["texts"] > 10 and found["cut"] == 0
+    assert found["film"] == [SIZE, SIZE, ""], "the page's own player must read the codec that videos are written in"
 
 
 def test_phone_width_does_not_scroll_sideways(report, browse, tmp_path):

@@ -122,9 +122,7 @@ def test_page_is_self_contained_and_accessible(run):
     identities = [attrs["id"] for _, attrs in page.tags if attrs.get("id")]
     assert len(identities) == len(set(identities))
     sections = ("tables", "pareto", "pictures", "figures", "videos", "training", "stages", "provenance")
-    assert {f"#{i}" for i in sections} == {
-        attrs["href"] for attrs in page.all("a") if attrs["href"].startswith("#")
-    }
+    assert {f"#{i}" for i in sections} == {attrs["href"] for attrs in page.all("a") if attrs["href"].startswith("#")}
     assert all(attrs["value"] in identities for attrs in page.all("option"))
     assert page.all("meta")[1]["name"] == "viewport"
     assert "smoke size: not comparable with the paper" in text and "Ablation &lt;study&gt;" in text
