@@ -7,7 +7,6 @@ milliseconds.
 
 import contextlib
 import ctypes
-import gc
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -247,7 +246,6 @@ def _resident(key: str) -> float:
 
 def _give_back() -> None:
     """Returns freed memory to the system, so that a peak is not hidden by what an earlier picture left behind."""
-    gc.collect()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
 

@@ -5,7 +5,6 @@ that are absent, and everything when no billboard is in the picture.
 """
 
 import contextlib
-import copy
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -18,12 +17,12 @@ from nbavatar.avatar.base import Stages, compose
 from nbavatar.avatar.billboards import Posed
 from nbavatar.avatar.model import Avatar
 from nbavatar.avatar.region import Region, full_region, paste, region_of, shift_camera, visible_box
-from nbavatar.avatar.unet import UNet
 from nbavatar.config.core import to_mapping
 from nbavatar.config.tradeoff import SettingConfig
 from nbavatar.errors import DataError
 from nbavatar.raster.functional import render_billboards
 from nbavatar.tradeoff.contribution import most_contributing
+from nbavatar.tradeoff.decoder import prepared_unet
 from nbavatar.tradeoff.reduce import keep_billboards, keep_parts, resize_textures
 from nbavatar.tradeoff.textures import resample_textures
 
@@ -100,7 +99,7 @@ class TunedAvatar:
         if setting.texels is not None:
             avatar = resize_textures(avatar, setting.texels)
         self.avatar = avatar
-        self._unet = _in_layout(avatar.unet, setting.channels_last)
+        self._unet = prepared_unet(avatar.unet, channels_last=setting.channels_last, batch_norm=setting.norm == "batch")
         self._scenes: dict[tuple[str, ...], _Scene] = {}
 
     @property
@@ -327,13 +326,6 @@ def texels_needed(posed: Posed, viewmat: Tensor, K: Tensor) -> int:
     depth = (posed.means @ viewmat[2, :3] + viewmat[2, 3]).clamp_min(1e-6)
     reach = posed.half_extents.amax(1) / depth * torch.maximum(K[0, 0], K[1, 1])
     return int(torch.ceil(2.0 * torch.quantile(reach, _MIP_SHARE)).clamp(0, 1 << 20)) + 1
-
-
-def _in_layout(unet: UNet | None, channels_last: bool) -> UNet | None:
-    """The U-Net with its weights in the memory layout asked for; the avatar's own is channels last."""
-    if unet is None or channels_last:
-        return unet
-    return copy.deepcopy(unet).to(memory_format=torch.contiguous_format)
 
 
 @contextlib.contextmanager

@@ -106,6 +106,15 @@ def test_decoding_at_half_size_works_on_a_quarter_of_the_pixels() -> None:
     assert work == {1.0: SIZE**2, 0.5: SIZE**2 // 4, 0.25: SIZE**2 // 16}
 
 
+@pytest.mark.parametrize("norm", ["instance", "batch"])
+@pytest.mark.parametrize("last", [True, False])
+def test_layout_and_normalisation_change_rounding_only(norm: str, last: bool) -> None:
+    avatar = make_avatar()
+    tuned = TunedAvatar(avatar, SettingConfig(norm=norm, channels_last=last))
+    torch.testing.assert_close(picture(tuned), picture(avatar), atol=2e-5, rtol=0)
+    assert torch.equal(picture(TunedAvatar(avatar, SettingConfig())), picture(avatar))  # the avatar's own is untouched
+
+
 def test_half_resolution_is_the_avatar_in_a_frame_of_half_the_size_enlarged() -> None:
     avatar = make_avatar(deferred=False)
     small = torch.cat((K[:2] / 2, K[2:]))
