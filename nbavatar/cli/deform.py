@@ -7,7 +7,7 @@ Reads a mesh sequence (.npz) whose head is not deformed by contact (of `nbavatar
                              heuristic is used (distance to a skull proxy, last row of the picture), which assumes that
                              the rest pose has y up and z out of the face
   segments                   int [R, 2], optional: uncut runs of frames; nothing is carried over a cut
-  contact.*, deformation.head  optional: the dataset's own, the reference of --validate
+  contact.*, deformation.head  optional: the dataset's own, the reference of --validate; a capture's head_final likewise
 
 Writes a mesh sequence: head.verts deformed, hands with a small rigid correction, and
 
@@ -32,6 +32,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,13 +51,15 @@ from nbavatar.physics.contact import ContactNumbers, ContactSolver
 from nbavatar.physics.pictures import contact_picture
 from nbavatar.physics.sequence import SequenceSolver, enclosed_volume, pack, uncut_runs, unpack
 from nbavatar.physics.tissue import bed_stiffness, soft_surface, tissue_thickness
-from nbavatar.physics.validation import compare_deformation, plausibility, vertex_areas
+from nbavatar.physics.validation import compare_deformation, compare_labels, head_distances, plausibility, vertex_areas
 from nbavatar.provenance import code_digest, file_digest, run_record
 
 __all__ = ["add_arguments", "main"]
 
 # Frames in a stored piece.
 _PIECE = 64
+# Where a reference brings no contact labels, vertices that it moves farther than this count as touched [m].
+_DENTED = 5e-4
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,6 +74,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PNG",
         help="measure the result (against the reference where there is one), print the figures, keep them in the "
         "record, and draw the deepest frame from three sides (default OUT with .png)",
+    )
+    parser.add_argument(
+        "--table", metavar="CSV", help="also write the figures of --validate: columns group, quantity, value"
     )
     add_cfg_argument(parser, DeformConfig)
 
@@ -96,13 +102,16 @@ def main(args: argparse.Namespace) -> None:
             head = sequence.parts["head"].verts
             result = MeshSequence(sequence.frames, sequence.parts, {**sequence.extras, "head_rigid": head})
     if args.validate is not None and state is not None:
-        record["validation"] = _validate(result, hands)
+        record["validation"] = _validate(sequence, result, hands)
         picture = args.validate or str(Path(args.out).with_suffix(".png"))
         with atomic_write(picture) as temporary:
             temporary.write_bytes(encode_png(_picture(result, hands, cfg.picture_size), level=6))
     elif args.validate:
         with atomic_write(args.validate) as temporary:
             temporary.write_bytes(encode_png(np.full((64, 64, 3), 255, np.uint8)))
+    if args.table:
+        with atomic_write(args.table) as temporary:
+            temporary.write_text(_table({key: record.get(key, {}) for key in ("frames", "validation")}))
     if args.exr:
         maps = {}
         if "head_rigid" in result.extras:
@@ -218,31 +227,55 @@ def _summary(frames: list[str], arrays: dict[str, np.ndarray]) -> dict[str, obje
     }
 
 
-def _validate(result: MeshSequence, hands: list[str]) -> dict[str, object]:
-    """Figures: before and after by themselves, and against the reference."""
+def _validate(sequence: MeshSequence, result: MeshSequence, hands: list[str]) -> dict[str, object]:
+    """Figures over the simulated frames: before and after by themselves, and over all frames against the reference."""
     head, rigid = result.parts["head"], result.extras["head_rigid"]
     mesh = DeformingMesh(head.rest, head.faces)
+    others = [DeformingMesh(result.parts[name].rest, result.parts[name].faces) for name in hands]
     figures: dict[str, object] = {}
     simulated = np.flatnonzero(result.extras["residual.active"] > 0)
-    for name in hands:
-        part = result.parts[name]
-        hand = DeformingMesh(part.rest, part.faces)
+    for name, hand in zip(hands, others, strict=True):
+        part, tracked = result.parts[name], sequence.parts[name].verts
         areas = (vertex_areas(head.rest, head.faces), vertex_areas(part.rest, part.faces))
+        figures[f"{name}.before"] = plausibility(mesh, hand, areas, rigid[simulated], tracked[simulated])
         figures[f"{name}.after"] = plausibility(mesh, hand, areas, head.verts[simulated], part.verts[simulated])
-        figures[f"{name}.before"] = plausibility(mesh, hand, areas, rigid[simulated], part.verts[simulated])
     change = [enclosed_volume(mesh, head.verts[i]) / enclosed_volume(mesh, rigid[i]) - 1.0 for i in simulated]
     figures["volume_change_percent"] = {
         "worst": float(100 * max(change, key=abs, default=0.0)),
         "mean": float(100 * np.mean(change)) if change else 0.0,
     }
     reference = result.extras.get("reference.deformation.head")
+    if reference is None and "head_final" in result.extras:
+        # A capture that brings heads before and after contact: of any method, so long as it is another than this one.
+        reference = result.extras["head_final"] - rigid
+        reference = reference if reference.any() else None
     if reference is not None:
-        labels = np.asarray(result.extras.get("reference.contact.head", np.linalg.norm(reference, axis=-1) > 1e-4))
-        agreement = compare_deformation(
-            head.verts - rigid, reference, result.extras["contact.head"], labels.astype(bool)
-        )
+        kept = np.flatnonzero(result.extras["residual.finite"])
+        labels = np.asarray(result.extras.get("reference.contact.head", np.linalg.norm(reference, axis=-1) > _DENTED))
+        labels = labels.astype(bool)[kept]
+        dent, touching = (head.verts - rigid)[kept], result.extras["contact.head"][kept]
+        agreement = compare_deformation(dent, reference[kept], touching, labels)
         figures["reference"] = {key: value if np.isfinite(value) else None for key, value in agreement.items()}
+        distance = head_distances(mesh, others, head.verts[kept], [result.parts[name].verts[kept] for name in hands])
+        figures["reference_labels"] = compare_labels(distance, labels)
     return figures
+
+
+def _table(figures: dict[str, Any]) -> str:
+    """Figures as CSV: nested names joined by full stops, the last one as the quantity; empty where there is none."""
+    rows = ["group,quantity,value"]
+
+    def add(group: str, entry: dict[str, Any]) -> None:
+        for name, value in entry.items():
+            if isinstance(value, dict):
+                add(f"{group}.{name}" if group else name, value)
+            elif isinstance(value, list):
+                rows.append(f"{group},{name},{' '.join(map(str, value))}")
+            else:
+                rows.append(f"{group},{name},{'' if value is None else value}")
+
+    add("", figures)
+    return "\n".join(rows) + "\n"
 
 
 def _picture(result: MeshSequence, hands: list[str], size: int) -> np.ndarray:

@@ -146,7 +146,10 @@ def _tell(part: str, summary: dict[str, Any]) -> None:
     if before is not None and after is not None:
         print(f"{part}: median keypoint error {before:.2f} -> {after:.2f} px in {len(summary['cameras'])} cameras")
     found = summary.get("handedness", {})
-    if found and found["found"] not in (found["expected"], "undecided"):
+    if found and found["found"] in (found["expected"], "undecided"):
+        said = "as said" if found["found"] == found["expected"] else "undecided"
+        print(f"{part}: side of the hand {said} (error by side [px]: {found['error_px']})")
+    elif found:
         print(
             f"nbavatar fit: warning: keypoints.{part} are said to be of the {found['expected']} hand, but fit "
             f"{found['found']} better (error by side [px]: {found['error_px']})",

@@ -230,7 +230,7 @@ def nearest(points, verts, faces, ids, true_faces, nodes, bounds, radius):
                         if square < best:
                             best = square
                             face[i] = ids[f]
-                            weights[i] = weight
+                            weights[i, 0], weights[i, 1], weights[i, 2] = weight[0], weight[1], weight[2]
             else:
                 dl = _box_distance(bounds, left, p[0], p[1], p[2])
                 dr = _box_distance(bounds, right, p[0], p[1], p[2])

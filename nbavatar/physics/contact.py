@@ -60,7 +60,7 @@ class FrameResult(NamedTuple):
         pose: correction of each hand, translation [m] and rotation vector [rad] about the hand's centroid, (H, 6).
         head_contact: head vertices nearer to a hand than the touch distance, or corners of a face that is, (V,) bool;
             `hand_contact` likewise.
-        depth: greatest depth of vertices, and of edges between outer vertices, before and after [m]. steps: steps taken.
+        depth: greatest depth of vertices, and edges between outer ones, before and after [m]. steps: steps taken.
         exceeded: the depth left is over the tolerance, or a bound (dent, hand correction) was reached.
         active: number of simulated head vertices; 0 where nothing was to be done and the input is returned as it was.
     """

@@ -1,11 +1,15 @@
 """How good a contact deformation is: against a reference, and by itself."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.physics.collision import measure_overlap
 
-__all__ = ["compare_deformation", "plausibility", "vertex_areas"]
+__all__ = ["compare_deformation", "compare_labels", "head_distances", "plausibility", "vertex_areas"]
+
+_TOUCH = (0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.008, 0.01)
 
 
 def compare_deformation(
@@ -19,17 +23,18 @@ def compare_deformation(
         moved: direction is compared where both displacements are longer than this [m].
 
     Returns:
-        On the reference's contact vertices: `mean_mm`, `p95_mm`, `max_mm` of the difference, and `reference_mm`, the
-        mean length of the reference there (the error of doing nothing). On all vertices that either moves by `moved`:
-        `moved_mean_mm`, `moved_reference_mm`, and `cosine` of the directions. `contact_precision`, `contact_recall`,
-        `contact_f1` of the labels. NaN where there is nothing to compare.
+        On the reference's contact vertices: `mean_mm`, `p95_mm`, `max_mm` of the difference, `reference_mm`, the mean
+        length of the reference there (the error of doing nothing), and `cosine` of the directions. On all vertices
+        that either moves by `moved`, the rim of the dent included: `moved_mean_mm`, `moved_reference_mm`,
+        `moved_cosine`. `contact_precision`, `contact_recall`, `contact_f1` of the labels. NaN where there is nothing
+        to compare.
     """
     error = np.linalg.norm(ours - reference, axis=-1) * 1e3
     length, reference_length = (np.linalg.norm(field, axis=-1) for field in (ours, reference))
     contact = reference_touching & np.isfinite(error)
     both = (length > moved) & (reference_length > moved)
     either = (length > moved) | (reference_length > moved)
-    cosine = (ours[both] * reference[both]).sum(-1) / (length[both] * reference_length[both])
+    cosine = (ours * reference).sum(-1) / np.maximum(length * reference_length, 1e-12)
     hits = float((touching & reference_touching).sum())
     precision = hits / touching.sum() if touching.any() else np.nan
     recall = hits / reference_touching.sum() if reference_touching.any() else np.nan
@@ -38,12 +43,67 @@ def compare_deformation(
         "p95_mm": float(np.percentile(error[contact], 95)) if contact.any() else np.nan,
         "max_mm": float(error[contact].max()) if contact.any() else np.nan,
         "reference_mm": _mean(reference_length[contact]) * 1e3,
+        "cosine": _mean(cosine[both & contact]),
         "moved_mean_mm": _mean(error[either]),
         "moved_reference_mm": _mean(reference_length[either]) * 1e3,
-        "cosine": _mean(cosine),
+        "moved_cosine": _mean(cosine[both]),
         "contact_precision": float(precision),
         "contact_recall": float(recall),
         "contact_f1": float(2 * hits / max(touching.sum() + reference_touching.sum(), 1)),
+    }
+
+
+def head_distances(
+    head: DeformingMesh, hands: list[DeformingMesh], heads: np.ndarray, posed: list[np.ndarray], radius: float = 0.01
+) -> np.ndarray:
+    """Distance of every head vertex to the nearest hand, inside or outside.
+
+    Args:
+        head: hierarchy of the head, `hands` of each hand; moved by this function.
+        heads: (N, V, 3) [m]; `posed` (N, Vh, 3) [m] of each hand. Finite.
+        radius: how far to look [m].
+
+    Returns:
+        (N, V) [m], inf beyond the radius.
+    """
+    result = np.full(heads.shape[:2], np.inf)
+    for n, verts in enumerate(heads):
+        head.move(verts)
+        for hand, at in zip(hands, posed, strict=True):
+            hand.move(at[n])
+            overlap = measure_overlap(head, hand, (len(verts), at.shape[1]), radius)
+            result[n] = np.minimum(result[n], np.where(overlap.head_depth > 0, 0.0, overlap.head_distance))
+    return result
+
+
+def compare_labels(
+    distance: np.ndarray, reference_touching: np.ndarray, touch: Sequence[float] = _TOUCH
+) -> dict[str, object]:
+    """Contact labels by distance against a reference whose touch distance is not known.
+
+    Args:
+        distance: of vertices to the nearest hand [m], (N, V).
+        reference_touching: (N, V) bool.
+        touch: distances below which a vertex would count as touching [m].
+
+    Returns:
+        `f1_by_touch_mm`, F-score at each distance; `best_touch_mm`, the one at which it is highest, with `precision`,
+        `recall` and `f1` there.
+    """
+    scores = {}
+    for limit in touch:
+        ours = distance < limit
+        hits = float((ours & reference_touching).sum())
+        scores[limit] = (
+            hits / max(float(ours.sum()), 1.0),
+            hits / max(float(reference_touching.sum()), 1.0),
+            2.0 * hits / max(float(ours.sum() + reference_touching.sum()), 1.0),
+        )
+    best = max(scores, key=lambda limit: scores[limit][2])
+    return {
+        "f1_by_touch_mm": {f"{1e3 * limit:g}": score[2] for limit, score in scores.items()},
+        "best_touch_mm": 1e3 * best,
+        **dict(zip(("precision", "recall", "f1"), scores[best], strict=True)),
     }
 
 

@@ -62,112 +62,143 @@ def relax(
     stretch_a = 1.0 / (stretch * h2) if stretch > 0.0 else 0.0
     shear_a = 1.0 / (shear * h2) if shear > 0.0 else 0.0
     for _ in range(iterations):
-        # Bed: every vertex to its rest place.
-        for s in range(len(active)):
-            i = active[s]
-            w = inverse_mass[i]
-            if w > 0.0 and support[i] > 0.0:
-                a = 1.0 / (support[i] * h2)
-                for c in range(3):
-                    step = (rest[i, c] - x[i, c] - a * support_l[s, c]) / (w + a)
-                    support_l[s, c] += step
-                    x[i, c] += w * step
-        # Membrane: every edge to its rest length.
+        _support(x, rest, inverse_mass, active, support, h2, support_l)
         if stretch > 0.0:
-            for e in range(len(edges)):
-                i, j = edges[e, 0], edges[e, 1]
-                w = inverse_mass[i] + inverse_mass[j]
-                d0, d1, d2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
-                length = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-                if w > 0.0 and length > 1e-12:
-                    step = (lengths[e] - length - stretch_a * stretch_l[e]) / (w + stretch_a)
-                    stretch_l[e] += step
-                    step /= length
-                    wi, wj = inverse_mass[i] * step, inverse_mass[j] * step
-                    x[i, 0] += wi * d0
-                    x[i, 1] += wi * d1
-                    x[i, 2] += wi * d2
-                    x[j, 0] -= wj * d0
-                    x[j, 1] -= wj * d1
-                    x[j, 2] -= wj * d2
-        # Shear layer: neighbours are displaced alike.
+            _stretch(x, inverse_mass, edges, lengths, stretch_a, stretch_l)
         if shear > 0.0:
-            for e in range(len(edges)):
-                i, j = edges[e, 0], edges[e, 1]
-                wi, wj = inverse_mass[i], inverse_mass[j]
-                if wi + wj > 0.0:
-                    for c in range(3):
-                        gap = (x[i, c] - rest[i, c]) - (x[j, c] - rest[j, c])
-                        step = (-gap - shear_a * shear_l[e, c]) / (wi + wj + shear_a)
-                        shear_l[e, c] += step
-                        x[i, c] += wi * step
-                        x[j, c] -= wj * step
-        # Plate: the displacement's Laplacian to zero.
-        for s in range(len(active)):
-            i = active[s]
-            if bend[i] <= 0.0:
-                continue
-            a = 1.0 / (bend[i] * h2)
-            total, w = 0.0, 0.0
-            c0, c1, c2 = 0.0, 0.0, 0.0
-            u0, u1, u2 = x[i, 0] - rest[i, 0], x[i, 1] - rest[i, 1], x[i, 2] - rest[i, 2]
-            for t in range(ring[i], ring[i + 1]):
-                j, r = ring_ids[t], ring_weights[t]
-                c0 += r * (x[j, 0] - rest[j, 0] - u0)
-                c1 += r * (x[j, 1] - rest[j, 1] - u1)
-                c2 += r * (x[j, 2] - rest[j, 2] - u2)
-                total += r
-                w += r * r * inverse_mass[j]
-            w += total * total * inverse_mass[i]
-            if w <= 0.0:
-                continue
-            s0 = (-c0 - a * bend_l[s, 0]) / (w + a)
-            s1 = (-c1 - a * bend_l[s, 1]) / (w + a)
-            s2 = (-c2 - a * bend_l[s, 2]) / (w + a)
-            bend_l[s, 0] += s0
-            bend_l[s, 1] += s1
-            bend_l[s, 2] += s2
-            for t in range(ring[i], ring[i + 1]):
-                j = ring_ids[t]
-                f = ring_weights[t] * inverse_mass[j]
-                x[j, 0] += f * s0
-                x[j, 1] += f * s1
-                x[j, 2] += f * s2
-            f = total * inverse_mass[i]
-            x[i, 0] -= f * s0
-            x[i, 1] -= f * s1
-            x[i, 2] -= f * s2
-        # Volume: what is pressed in comes out beside, as far as the tissue resists compression.
+            _shear(x, rest, inverse_mass, edges, shear_a, shear_l)
+        _bend(x, rest, inverse_mass, active, ring, ring_ids, ring_weights, bend, h2, bend_l)
+        # What is pressed in comes out beside, as far as the tissue resists compression.
         if volume_stiffness > 0.0:
             volume_l += _hold_volume(
                 x, inverse_mass, active, faces, bulge, gradient, origin, volume, volume_l, volume_stiffness * h2
             )
-        # Hands: towards their tracked pose, never beyond the bound.
-        for k in range(len(pose)):
-            for part in range(2):
-                w = pose_inverse_mass[k, part]
-                if w > 0.0 and pose_stiffness[part] > 0.0:
-                    a = 1.0 / (pose_stiffness[part] * h2)
-                    for c in range(3 * part, 3 * part + 3):
-                        step = (-pose[k, c] - a * pose_l[k, c]) / (w + a)
-                        pose_l[k, c] += step
-                        pose[k, c] += w * step
+        _hold_hands(pose, pose_inverse_mass, pose_stiffness, h2, pose_l)
         _bound(pose, pose_bound)
         _touch(
             x, start, inverse_mass, contacts, ids, weights, hand, pose, entry, pose_inverse_mass, centre, friction,
             pressed, sheared,
         )  # fmt: skip
         _bound(pose, pose_bound)
-        for s in range(len(active)):
-            i = active[s]
-            u0, u1, u2 = x[i, 0] - rest[i, 0], x[i, 1] - rest[i, 1], x[i, 2] - rest[i, 2]
-            square = u0 * u0 + u1 * u1 + u2 * u2
-            if square > max_dent * max_dent and inverse_mass[i] > 0.0:
-                shrink = max_dent / math.sqrt(square)
-                x[i, 0] = rest[i, 0] + shrink * u0
-                x[i, 1] = rest[i, 1] + shrink * u1
-                x[i, 2] = rest[i, 2] + shrink * u2
+        _limit(x, rest, inverse_mass, active, max_dent)
     return pressed
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _support(x, rest, inverse_mass, active, support, h2, impulse):
+    """Bed: every vertex to its rest place."""
+    for s in range(len(active)):
+        i = active[s]
+        w = inverse_mass[i]
+        if w > 0.0 and support[i] > 0.0:
+            a = 1.0 / (support[i] * h2)
+            for c in range(3):
+                step = (rest[i, c] - x[i, c] - a * impulse[s, c]) / (w + a)
+                impulse[s, c] += step
+                x[i, c] += w * step
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _stretch(x, inverse_mass, edges, lengths, compliance, impulse):
+    """Membrane: every edge to its rest length."""
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        w = inverse_mass[i] + inverse_mass[j]
+        d0, d1, d2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+        length = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+        if w > 0.0 and length > 1e-12:
+            step = (lengths[e] - length - compliance * impulse[e]) / (w + compliance)
+            impulse[e] += step
+            step /= length
+            wi, wj = inverse_mass[i] * step, inverse_mass[j] * step
+            x[i, 0] += wi * d0
+            x[i, 1] += wi * d1
+            x[i, 2] += wi * d2
+            x[j, 0] -= wj * d0
+            x[j, 1] -= wj * d1
+            x[j, 2] -= wj * d2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _shear(x, rest, inverse_mass, edges, compliance, impulse):
+    """Shear layer: neighbours are displaced alike."""
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        wi, wj = inverse_mass[i], inverse_mass[j]
+        if wi + wj > 0.0:
+            for c in range(3):
+                gap = (x[i, c] - rest[i, c]) - (x[j, c] - rest[j, c])
+                step = (-gap - compliance * impulse[e, c]) / (wi + wj + compliance)
+                impulse[e, c] += step
+                x[i, c] += wi * step
+                x[j, c] -= wj * step
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _bend(x, rest, inverse_mass, active, ring, ring_ids, ring_weights, bend, h2, impulse):
+    """Plate: the displacement's Laplacian to zero."""
+    for s in range(len(active)):
+        i = active[s]
+        if bend[i] <= 0.0:
+            continue
+        a = 1.0 / (bend[i] * h2)
+        total, w = 0.0, 0.0
+        c0, c1, c2 = 0.0, 0.0, 0.0
+        u0, u1, u2 = x[i, 0] - rest[i, 0], x[i, 1] - rest[i, 1], x[i, 2] - rest[i, 2]
+        for t in range(ring[i], ring[i + 1]):
+            j, r = ring_ids[t], ring_weights[t]
+            c0 += r * (x[j, 0] - rest[j, 0] - u0)
+            c1 += r * (x[j, 1] - rest[j, 1] - u1)
+            c2 += r * (x[j, 2] - rest[j, 2] - u2)
+            total += r
+            w += r * r * inverse_mass[j]
+        w += total * total * inverse_mass[i]
+        if w <= 0.0:
+            continue
+        s0 = (-c0 - a * impulse[s, 0]) / (w + a)
+        s1 = (-c1 - a * impulse[s, 1]) / (w + a)
+        s2 = (-c2 - a * impulse[s, 2]) / (w + a)
+        impulse[s, 0] += s0
+        impulse[s, 1] += s1
+        impulse[s, 2] += s2
+        for t in range(ring[i], ring[i + 1]):
+            j = ring_ids[t]
+            f = ring_weights[t] * inverse_mass[j]
+            x[j, 0] += f * s0
+            x[j, 1] += f * s1
+            x[j, 2] += f * s2
+        f = total * inverse_mass[i]
+        x[i, 0] -= f * s0
+        x[i, 1] -= f * s1
+        x[i, 2] -= f * s2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _hold_hands(pose, pose_inverse_mass, pose_stiffness, h2, impulse):
+    """Hands: towards their tracked pose."""
+    for k in range(len(pose)):
+        for part in range(2):
+            w = pose_inverse_mass[k, part]
+            if w > 0.0 and pose_stiffness[part] > 0.0:
+                a = 1.0 / (pose_stiffness[part] * h2)
+                for c in range(3 * part, 3 * part + 3):
+                    step = (-pose[k, c] - a * impulse[k, c]) / (w + a)
+                    impulse[k, c] += step
+                    pose[k, c] += w * step
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _limit(x, rest, inverse_mass, active, max_dent):
+    """No point goes farther than `max_dent` from its rest place."""
+    for s in range(len(active)):
+        i = active[s]
+        u0, u1, u2 = x[i, 0] - rest[i, 0], x[i, 1] - rest[i, 1], x[i, 2] - rest[i, 2]
+        square = u0 * u0 + u1 * u1 + u2 * u2
+        if square > max_dent * max_dent and inverse_mass[i] > 0.0:
+            shrink = max_dent / math.sqrt(square)
+            x[i, 0] = rest[i, 0] + shrink * u0
+            x[i, 1] = rest[i, 1] + shrink * u1
+            x[i, 2] = rest[i, 2] + shrink * u2
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -282,9 +282,17 @@ def test_command_line(tmp_path, capsys):
     fitted, record = read_sequence(tmp_path / "fit.npz")
     assert vertex_error_mm(fitted.parts["head"].verts, take.truth["head"]) < 0.05
     assert record["fit"]["right_hand"]["handedness"]["found"] == "right"
+    assert "right_hand: side of the hand as said" in capsys.readouterr().out
     assert decode_image(tmp_path / "fit.png").shape[0] > 4 * 96
     assert main([*map(str, command[:-2]), "--cfg", '{"iterations": -1}']) == 2
     assert "iterations" in capsys.readouterr().err
+    wrong = {key.replace("right_hand", "left_hand"): value for key, value in take.extras.items() if ".head." not in key}
+    write_arrays(tmp_path / "tracks.npz", {"frames": np.array(take.frames), **wrong}, {})
+    assert main([*map(str, command[:-4]), "--cfg", '{"iterations": 5}']) == 0
+    printed = capsys.readouterr().err
+    assert "keypoints.left_hand are said to be of the left hand, but fit right better" in printed
+    verdict = read_sequence(tmp_path / "fit.npz")[1]["fit"]["left_hand"]["handedness"]
+    assert verdict["expected"] == "left" and verdict["found"] == "right"
 
 
 @pytest.mark.slow

@@ -127,9 +127,21 @@ def test_verb_writes_sequence_maps_and_picture(tmp_path, clip, capsys):
     _write(tmp_path / "in.npz", (broken, clip[1]), **{"deformation.head": reference, "segments": np.array([[0, 7]])})
     arguments = ["deform", "--meshes", str(tmp_path / "in.npz"), "--out", str(tmp_path / "out.npz")]
     arguments += ["--exr", str(tmp_path / "out.exr.zip"), "--validate", str(tmp_path / "out.png")]
-    arguments += ["--cfg", json.dumps({"picture_size": 64, "stiffness": "uniform"})]
+    arguments += ["--cfg", json.dumps({"picture_size": 64, "stiffness": "uniform"}), "--table", str(tmp_path / "o.csv")]
     assert main(arguments) == 0
     figures = json.loads(capsys.readouterr().out)
+    rows = dict(line.rsplit(",", 1) for line in (tmp_path / "o.csv").read_text().splitlines())
+    assert rows["frames,not_finite"] == "f7" and rows["group,quantity"] == "value"
+    for group, quantity in (
+        ("right_hand.before", "max_depth_mm"), ("right_hand.before", "volume_mm3"), ("right_hand.after", "volume_mm3"),
+        ("right_hand.after", "non_collision_ratio"), ("right_hand.after", "touch_ratio"),
+        ("volume_change_percent", "worst"), ("reference", "moved_mean_mm"), ("reference_labels", "f1"),
+    ):  # fmt: skip
+        assert float(rows[f"validation.{group},{quantity}"]) == figures["validation"][group][quantity]
+    assert (
+        figures["validation"]["right_hand.after"]["volume_mm3"]
+        < figures["validation"]["right_hand.before"]["volume_mm3"]
+    )
     assert figures["frames"]["not_finite"] == ["f7"] and figures["frames"]["simulated"] == 5
     assert figures["validation"]["right_hand.after"]["max_depth_mm"] < 0.2
     assert figures["validation"]["right_hand.before"]["max_depth_mm"] > 5
@@ -176,3 +188,49 @@ def test_verb_passes_on_scenes_without_a_pair(tmp_path, clip, left):
     result, _ = read_sequence(tmp_path / "out.npz")
     assert result.parts[left].verts.tobytes() == part.verts.tobytes()
     assert (tmp_path / "o.png").is_file() and (tmp_path / "o.exr.zip").is_file()
+
+
+def test_verb_measures_against_a_captures_own_deformed_heads(tmp_path, clip, capsys):
+    short = tuple(part[:4] for part in clip)
+    _write(tmp_path / "in.npz", short)
+    arguments = ["deform", "--meshes", str(tmp_path / "in.npz"), "--out", str(tmp_path / "out.npz")]
+    assert main(arguments) == 0
+    own = read_sequence(tmp_path / "out.npz")[0].parts["head"].verts
+    _write(tmp_path / "in.npz", short, head_final=own)
+    capsys.readouterr()
+    assert main([*arguments, "--validate", "--cfg", '{"picture_size": 64}']) == 0
+    reference = json.loads(capsys.readouterr().out)["validation"]["reference"]
+    assert reference["mean_mm"] == 0 and reference["reference_mm"] > 1
+    np.testing.assert_allclose(reference["cosine"], 1.0, rtol=1e-6)
+    assert (tmp_path / "out.png").is_file()
+
+
+def test_a_killed_run_goes_on_where_it_stopped(tmp_path, clip, monkeypatch, capsys):
+    """Pieces that are there are not solved again, and the result has the bits of an unbroken run."""
+    from nbavatar.cli import deform as verb
+
+    monkeypatch.setattr(verb, "_PIECE", 3)
+    _write(tmp_path / "in.npz", clip)
+    arguments = ["deform", "--meshes", str(tmp_path / "in.npz"), "--out", str(tmp_path / "out.npz")]
+    assert main(arguments) == 0
+    whole = (tmp_path / "out.npz").read_bytes()
+    (tmp_path / "out.npz").unlink()
+    frames, solved = SequenceSolver.frames, []
+
+    def counted(self, head, hands, first, last):
+        for i, record in enumerate(frames(self, head, hands, first, last)):
+            if stop is not None and first + i == stop:
+                raise KeyboardInterrupt
+            solved.append(first + i)
+            yield record
+
+    monkeypatch.setattr(SequenceSolver, "frames", counted)
+    stop: int | None = 7
+    with pytest.raises((KeyboardInterrupt, SystemExit)):
+        raise SystemExit(main(arguments))
+    assert not (tmp_path / "out.npz").exists() and solved == [0, 1, 2, 3, 4, 5, 6]
+    stop = None
+    solved.clear()
+    assert main(arguments) == 0
+    assert solved == [6, 7] and (tmp_path / "out.npz").read_bytes() == whole
+    assert not (tmp_path / "out.npz.state").exists()

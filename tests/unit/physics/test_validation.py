@@ -6,7 +6,7 @@ import pytest
 from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.physics.shapes import capsule_hand, press, round_head
 from nbavatar.physics.tissue import bed_stiffness, tissue_thickness
-from nbavatar.physics.validation import compare_deformation, plausibility, vertex_areas
+from nbavatar.physics.validation import compare_deformation, compare_labels, head_distances, plausibility, vertex_areas
 
 
 def test_comparison_of_known_fields():
@@ -21,6 +21,7 @@ def test_comparison_of_known_fields():
     np.testing.assert_allclose(figures["max_mm"], 3.0)
     np.testing.assert_allclose(figures["reference_mm"], 3.0)
     np.testing.assert_allclose(figures["cosine"], (0.8 + 1.0) / 2)
+    np.testing.assert_allclose(figures["moved_cosine"], (0.8 + 1.0) / 2)
     assert (figures["contact_precision"], figures["contact_recall"], figures["contact_f1"]) == (0.5, 0.5, 0.5)
 
 
@@ -33,6 +34,36 @@ def test_comparison_with_itself_is_perfect_and_with_nothing_is_the_reference():
     nothing = compare_deformation(field * 0, field, ~labels, labels)
     np.testing.assert_allclose(nothing["mean_mm"], nothing["reference_mm"])
     assert nothing["contact_f1"] == 0
+
+
+def test_directions_are_compared_on_contact_apart_from_the_rim():
+    """One vertex under the hand agrees, one beside it bulges the other way."""
+    reference, ours = np.zeros((1, 2, 3)), np.zeros((1, 2, 3))
+    reference[0, :, 2], ours[0, :, 2] = -0.002, [-0.003, 0.001]
+    figures = compare_deformation(ours, reference, np.ones((1, 2), bool), np.array([[True, False]]))
+    assert figures["cosine"] == 1.0 and figures["moved_cosine"] == 0.0
+
+
+def test_the_touch_distance_of_a_reference_is_found():
+    distance = np.random.default_rng(0).uniform(0, 0.02, (3, 400))
+    agreement = compare_labels(distance, distance < 0.004)
+    assert agreement["best_touch_mm"] == 4.0 and agreement["f1"] == agreement["precision"] == agreement["recall"] == 1
+    scores = agreement["f1_by_touch_mm"]
+    assert isinstance(scores, dict) and scores["2"] < scores["3"] < scores["4"] > scores["5"] > scores["10"]
+
+
+def test_distances_of_the_head_are_the_nearest_hands():
+    import igl
+
+    (head, faces), (hand, hand_faces) = round_head(900), capsule_hand(300)
+    posed = [press(hand, -0.003), press(hand, 0.002) * [-1.0, 1.0, -1.0]]
+    meshes = [DeformingMesh(hand, hand_faces) for _ in posed]
+    found = head_distances(DeformingMesh(head, faces), meshes, head[None], [at[None] for at in posed])[0]
+    squares = [igl.point_mesh_squared_distance(head, at, hand_faces)[0] for at in posed]
+    outside = np.all([igl.winding_number(at, hand_faces, head) < 0.4 for at in posed], axis=0)
+    expected = np.sqrt(np.minimum(*squares))
+    np.testing.assert_allclose(found[outside], np.where(expected < 0.01, expected, np.inf)[outside], atol=1e-12)
+    assert np.isfinite(found).sum() > 10
 
 
 @pytest.mark.parametrize(("depth", "collides", "touches"), [(-0.02, 0, 0), (-0.003, 0, 1), (0.004, 1, 1)])
