@@ -5,7 +5,7 @@
     --camera   frame pack (.zip) of `nbavatar crop`: its camera is the one that looks, or that the turntable starts from
     --kind     turntable: one frame, the camera going around it; driven: every frame, the camera at rest
     --render   instead of all these: a frame pack of `nbavatar render`, whose pictures become the frames
-    --out      mp4 (VP9, or mp4v by --codec), and a record beside it: <out>.json
+    --out      mp4 (VP9, or mp4v by option), and a record beside it: <out>.json
 
 Needs OpenCV (package opencv-contrib-python-headless, extra `pipeline`) to encode; rendering itself does not, so a
 node without it can run `nbavatar render`, and this command elsewhere with --render. One picture is in memory at a time.
@@ -17,11 +17,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nbavatar.cli.common import progress
+from nbavatar.cli.common import add_cfg_argument, progress, stage_config
+from nbavatar.config.core import to_mapping
+from nbavatar.config.evaluation import VideoConfig
 from nbavatar.devices import device_name, lease_device
 from nbavatar.errors import ConfigError, DataError, did_you_mean
 from nbavatar.io.records import write_json
-from nbavatar.io.video import CODECS, VideoWriter
+from nbavatar.io.video import VideoWriter
 from nbavatar.provenance import run_record
 
 if TYPE_CHECKING:
@@ -38,18 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--render", metavar="ZIP", help="pictures to encode as they are")
     parser.add_argument("--kind", default="driven", choices=("driven", "turntable"), help="what moves")
     parser.add_argument("--frame", metavar="ID", help="turntable: which frame; the middle one by default")
-    parser.add_argument("--frames", type=int, metavar="N", help="at most N pictures; all (turntable: 4 s) by default")
-    parser.add_argument(
-        "--arc",
-        type=float,
-        default=360.0,
-        metavar="DEG",
-        help="turntable: angle; below 360 it swings [degrees]",
-    )
-    parser.add_argument("--fps", type=float, default=25.0, metavar="N", help="frames a second [1/s]")
-    parser.add_argument("--codec", default="vp09", choices=CODECS, help="vp09 plays in browsers; mp4v encodes faster")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
     parser.add_argument("--out", required=True, metavar="MP4", help="video to write")
+    add_cfg_argument(parser, VideoConfig)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -60,25 +53,24 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError.of("nbavatar video", expected="--model, --meshes and --camera, or --render", found=found)
     if Path(args.out).suffix != ".mp4":
         raise ConfigError.of("--out", expected="a name that ends in .mp4", found=args.out)
-    if args.fps <= 0 or args.arc <= 0 or (args.frames is not None and args.frames < 1):
-        raise ConfigError.of("--fps, --arc, --frames", expected="positive numbers", found="one that is not")
+    cfg = stage_config(args, VideoConfig)
     with lease_device("cpu" if args.render else args.device) as device:
-        count, pictures = _stored(args) if args.render else _rendered(args, device)
-        with VideoWriter(args.out, args.fps, args.codec) as writer:
+        count, pictures = _stored(args, cfg) if args.render else _rendered(args, cfg, device)
+        with VideoWriter(args.out, cfg.fps, cfg.codec) as writer:
             for picture in progress(pictures, f"video {args.kind}", count):
                 writer.add(picture)
-        config = {name: getattr(args, name) for name in ("kind", "frame", "frames", "arc", "fps", "codec")}
+        config = to_mapping(cfg) | {"kind": args.kind, "frame": args.frame}
         record = run_record("video", config=config, inputs=given, device=device_name(device))
     write_json(f"{args.out}.json", {"kind": "video", "frames": count, "record": record})
-    print(f"{args.out}: {count} frames, {count / args.fps:.1f} s, {Path(args.out).stat().st_size / 1e6:.1f} MB")
+    print(f"{args.out}: {count} frames, {count / cfg.fps:.1f} s, {Path(args.out).stat().st_size / 1e6:.1f} MB")
     return 0
 
 
-def _stored(args: argparse.Namespace) -> tuple[int, Iterator["np.ndarray"]]:
+def _stored(args: argparse.Namespace, cfg: VideoConfig) -> tuple[int, Iterator["np.ndarray"]]:
     from nbavatar.io.framepack import FramePack
 
     pack = FramePack(args.render)
-    names = pack.frames[: args.frames]
+    names = pack.frames[: cfg.max_frames]
 
     def pictures() -> Iterator["np.ndarray"]:
         with pack:
@@ -88,7 +80,7 @@ def _stored(args: argparse.Namespace) -> tuple[int, Iterator["np.ndarray"]]:
     return len(names), pictures()
 
 
-def _rendered(args: argparse.Namespace, device: str) -> tuple[int, Iterator["np.ndarray"]]:
+def _rendered(args: argparse.Namespace, cfg: VideoConfig, device: str) -> tuple[int, Iterator["np.ndarray"]]:
     from nbavatar.avatar.storage import load_avatar
     from nbavatar.config.evaluation import ProtocolConfig
     from nbavatar.data.sequences import read_sequence
@@ -110,11 +102,10 @@ def _rendered(args: argparse.Namespace, device: str) -> tuple[int, Iterator["np.
                 raise DataError.of(args.meshes, f"frame {args.frame}", expected="a frame of the sequence",
                                    found="none", fix=did_you_mean(args.frame, sequence.frames))  # fmt: skip
             row = sequence.frames.index(args.frame)
-        count = args.frames or round(4 * args.fps)
-        arc = math.radians(min(args.arc, 360.0))
-        views = turntable_views(sequence, row, manifest, K, camera, count, arc=arc)
+        count = max(1, round(cfg.seconds * cfg.fps))
+        views = turntable_views(sequence, row, manifest, K, camera, count, arc=math.radians(cfg.arc))
     else:
-        rows = list(range(len(sequence.frames)))[: args.frames]
+        rows = list(range(len(sequence.frames)))[: cfg.max_frames]
         # A reenactment's frames are another subject's: per-frame crops of this camera say nothing about them.
         own = per_frame if "driver" not in sequence.extras else {}
         views = driven_views(sequence, rows, manifest, K, camera)

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 from nbavatar.config.core import option, to_mapping
 
-__all__ = ["PROTOCOLS", "EvaluateConfig", "ProtocolConfig", "ReportConfig", "TableConfig", "protocol_hash"]
+__all__ = ["PROTOCOLS", "EvaluateConfig", "ProtocolConfig", "ReportConfig", "TableConfig", "VideoConfig"]
+__all__ += ["protocol_hash"]
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,19 @@ class ReportConfig:
     frames: int = option(3, "Frames shown per subject, variant and protocol, evenly spaced.", min=1, max=50)
     max_side: int = option(512, "Pictures are reduced to this side [px]; the files themselves are not.", min=32)
     video_mb: float = option(4.0, "Videos up to this size are put into the page, larger ones linked [MB].", min=0.0)
+
+
+@dataclass(frozen=True)
+class VideoConfig:
+    """Videos."""
+
+    fps: float = option(25.0, "Frames a second [1/s].", min=0.1)
+    seconds: float = option(4.0, "Length of a turntable [s].", min=0.1)
+    arc: float = option(360.0, "How far a turntable goes; below 360 it swings out and back [degrees].", min=1, max=360)
+    max_frames: int | None = option(None, "At most this many frames of a driven sequence; all by default.", min=1)
+    codec: str = option(
+        "vp09", "vp09 plays in browsers; mp4v encodes faster, for players only.", choices=("vp09", "mp4v")
+    )
 
 
 PROTOCOLS = {

@@ -48,7 +48,7 @@ def video(avatar, out, *extra):
 
 
 def test_driven_video_shows_what_render_shows(avatar, tmp_path):
-    assert video(avatar, tmp_path / "driven.mp4", "--codec", "mp4v") == 0
+    assert video(avatar, tmp_path / "driven.mp4", "--cfg", '{"codec": "mp4v"}') == 0
     shown = list(read_video(tmp_path / "driven.mp4"))
     assert len(shown) == len(FRAMES) and shown[0].shape == (SIZE, SIZE, 3)
     protocol = json.dumps({"name": "all", "split": "all"})
@@ -65,7 +65,10 @@ def test_driven_video_shows_what_render_shows(avatar, tmp_path):
 
 
 def test_turntable_goes_around(avatar, tmp_path):
-    assert video(avatar, tmp_path / "turn.mp4", "--kind", "turntable", "--frames", "5", "--frame", FRAMES[1]) == 0
+    assert (
+        video(avatar, tmp_path / "turn.mp4", "--kind", "turntable", "--frame", FRAMES[1], "--cfg", '{"seconds": 0.2}')
+        == 0
+    )
     assert len(list(read_video(tmp_path / "turn.mp4"))) == 5
     sequence, _ = read_sequence(avatar["meshes"])
     with FramePack(avatar["packs"][0]) as pack:
@@ -96,7 +99,7 @@ def test_turntable_goes_around(avatar, tmp_path):
 def test_frames_of_a_reenactment_are_driven_without_packs_of_their_own(avatar, tmp_path):
     out = tmp_path / avatar["subject"] / "other.npz"
     assert main(["reenact", "--source", avatar["meshes"], "--target", avatar["meshes"], "--out", str(out)]) == 0
-    assert video(avatar, tmp_path / "re.mp4", "--meshes", str(out), "--codec", "mp4v", "--frames", "2") == 0
+    assert video(avatar, tmp_path / "re.mp4", "--meshes", str(out), "--cfg", '{"codec": "mp4v", "max_frames": 2}') == 0
     layout = tmp_path / "figures.yaml"
     layout.write_text(
         "cross: {kind: reenactment, title: Cross, frames: 2}\nfeatures: {kind: features, title: Features}\n"
@@ -131,7 +134,7 @@ def test_principal_colours_ignore_scale_and_rotation_of_the_channels(rng):
     ("extra", "message"),
     [
         (["--frame", "nothing", "--kind", "turntable"], "frame nothing: expected a frame of the sequence"),
-        (["--fps", "0"], "positive numbers"),
+        (["--cfg", '{"fps": 0}'], "--cfg.fps"),
         (["--render", "x.zip"], "--model, --meshes and --camera, or --render"),
         (["--meshes", "nothing.npz"], "nothing.npz"),
     ],
