@@ -37,8 +37,8 @@ class SettingConfig:
     channels_last: bool = option(True, "Memory layout of the U-Net: channels last, else channels first.")
     norm: str = option(
         "instance",
-        "How the U-Net normalises: torch's instance normalisation, or the same sums as a batch normalisation of the one "
-        "picture, which spares copies on a CPU.",
+        "How the U-Net normalises: torch's instance normalisation, or the same sums as a batch normalisation of the "
+        "one picture, which spares copies on a CPU.",
         choices=("instance", "batch"),
     )
     threads: int | None = option(None, "Threads of the CPU; null: as many as torch takes.", min=1, max=1024)

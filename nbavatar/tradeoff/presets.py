@@ -48,7 +48,7 @@ def preset_entry(name: str, point: Point, exact: Point, limits: LimitConfig | No
         "name": name,
         "setting": to_mapping(point.setting),
         "label": point.label,
-        "why": f"{rule}: {point.speedup:.2f}x as fast, {-psnr:+.3f} dB, {lpips:+.4f} LPIPS",
+        "why": f"{rule}: {point.speedup:.2f}x as fast, {0.0 - psnr:+.3f} dB, {lpips:+.4f} LPIPS",
         "speedup": point.speedup,
         "psnr_lost": psnr,
         "lpips_gained": lpips,

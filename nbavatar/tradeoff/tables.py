@@ -90,7 +90,7 @@ def points_markdown(points: Sequence[Point], presets: Mapping[str, Point]) -> st
             *(f"{v['ms'][stage]:.1f}" for stage in ("raster", "renderer", "compose")),
             f"{point.speedup:.2f}x",
             f"{v['psnr']:.2f}",
-            f"{-psnr:+.3f}",
+            f"{0.0 - psnr:+.3f}",
             f"{v['lpips']:.4f}",
             f"{lpips:+.4f}",
             f"{100 * v['diff_share']:.2f}%",

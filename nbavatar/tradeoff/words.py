@@ -63,7 +63,7 @@ def point_sentence(point: Point, exact: Point, name: str, base: str) -> str:
         if abs(psnr) < _SAME_PSNR and abs(lpips) < _SAME_LPIPS:
             change += " and no quality figure"
         else:
-            change += f"; PSNR {-psnr:+.2f} dB, LPIPS {lpips:+.4f}"
+            change += f"; PSNR {0.0 - psnr:+.2f} dB, LPIPS {lpips:+.4f}"
     memory = values["peak_memory_mb"] - exact.values["peak_memory_mb"]
     extra = f", with {abs(memory):.0f} MB {'more' if memory > 0 else 'less'} memory" if abs(memory) >= 1 else ""
     return f"`{name}` {_speed(point.speedup)} `{base}`{extra}, and {change}."
