@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from skimage.metrics import structural_similarity
 
 from nbavatar.cli import main
@@ -42,10 +43,10 @@ def write_crop(path, camera, seed):
             pack.add("alpha", frame, alpha_of(seed + i))
 
 
-def write_render(path, images: dict[str, np.ndarray]):
+def write_render(path, images: dict[str, np.ndarray], record=None):
     manifest = {
         "stage": "render", "subject": "S2", "variant": "full", "camera": "*", "width": SIZE, "height": SIZE,
-        "cam_from_world": np.eye(4).tolist(), "frames": list(images), "layers": {"rgb": ""}, "record": {},
+        "cam_from_world": np.eye(4).tolist(), "frames": list(images), "layers": {"rgb": ""}, "record": record or {},
     }  # fmt: skip
     with FramePackWriter(path, manifest) as pack:
         for name, picture in images.items():
@@ -151,6 +152,57 @@ def test_same_files_give_the_same_bytes(files):
     first = (files / "eval.json").read_bytes(), (files / "eval.csv").read_bytes()
     run(files, files / "render.zip", extra=FAST)
     assert ((files / "eval.json").read_bytes(), (files / "eval.csv").read_bytes()) == first
+
+
+@pytest.mark.slow
+def test_other_kernels_change_no_digit_that_a_table_shows(files):
+    # Another machine takes other convolution kernels and sums in another order; this one too, without oneDNN.
+    # Tables show 2 digits of PSNR, 3 of SSIM and LPIPS; the figures agree to 1e-6.
+    write_render(files / "render.zip", {"102/0001": image(1), "102/0002": image(12)})
+    extra = ("--cfg", '{"device": "cpu"}')
+    results = []
+    threads = torch.get_num_threads()
+    for count, onednn in ((1, True), (2, False)):
+        torch.set_num_threads(count)
+        try:
+            with torch.backends.mkldnn.flags(enabled=onednn):
+                assert run(files, files / "render.zip", extra=extra) == 0
+        finally:
+            torch.set_num_threads(threads)
+        results.append(json.loads((files / "eval.json").read_text())["metrics"])
+    first, second = results
+    assert set(first) == {"psnr", "psnr_fg", "ssim", "ssim_fg", "lpips_alex", "lpips_vgg"}
+    for name, value in first.items():
+        assert second[name] == pytest.approx(value, abs=1e-6), name
+        digits = 2 if name.startswith("psnr") else 3
+        assert f"{second[name]:.{digits}f}" == f"{value:.{digits}f}"
+
+
+def test_features_are_computed_once_for_each_image(files, monkeypatch):
+    # A VGG16 pyramid of 1024 px is half a gigabyte and seconds of work: each truth's serves the render and both trivial
+    # answers, each trivial answer's serves every truth, and none is kept longer than it is needed.
+    from nbavatar.metrics.lpips import LPIPS
+
+    seen = []
+    original = LPIPS.features
+    monkeypatch.setattr(LPIPS, "features", lambda self, images: seen.append(self.net) or original(self, images))
+    write_render(files / "render.zip", {"102/0001": image(1), "102/0002": image(2)})
+    assert run(files, files / "render.zip", extra=("--cfg", '{"device": "cpu", "nets": ["alex", "vgg"]}')) == 0
+    # Two truths and two renders by both nets; background and mean image by the first net only.
+    assert seen.count("vgg") == 4 and seen.count("alex") == 4 + 2
+
+
+def test_what_a_training_took_is_carried_over_from_the_render(files):
+    training = {
+        "config": {"method": "splatting_avatar", "splatting_avatar": {"mode": "released"}, "seed": 1}, "steps": 300,
+        "seconds": 12.5, "primitives": 9000, "model_bytes": 123456, "last": {"loss": 1},
+    }  # fmt: skip
+    write_render(files / "render.zip", {"102/0001": image(1), "102/0002": image(2)}, record={"training": training})
+    assert run(files, files / "render.zip", extra=("--cfg", '{"nets": [], "device": "cpu"}')) == 0
+    assert json.loads((files / "eval.json").read_text())["training"] == {
+        "method": "splatting_avatar", "mode": "released", "steps": 300, "train_seconds": 12.5, "primitives": 9000,
+        "model_bytes": 123456,
+    }  # fmt: skip
 
 
 def test_digests_change_with_one_pixel(files):
