@@ -66,6 +66,7 @@ def main(args: argparse.Namespace) -> int:
         render = stack.enter_context(FramePack(args.render))
         truths = _by_camera([stack.enter_context(FramePack(path)) for path in args.frames])
         training = _by_camera([stack.enter_context(FramePack(path)) for path in args.train_frames])
+        _check_preset(render, protocol)
         result = _evaluate(render, truths, training, protocol, cfg, device)
         record = run_record(
             "evaluate",
@@ -156,6 +157,17 @@ def _training(record: dict[str, Any]) -> dict[str, Any]:
         **{key: record.get(key) for key in ("primitives", "model_bytes", "peak_memory_mb")},
     }
     return {key: value for key, value in kept.items() if value is not None}
+
+
+def _check_preset(render: FramePack, protocol: ProtocolConfig) -> None:
+    """Figures say which setting they are of: the render must have the protocol's."""
+    tuned = (render.manifest.get("record") or {}).get("tuned") or {}
+    used = tuned.get("preset") or ("a budget" if tuned else "")
+    if used != protocol.preset:
+        raise DataError.of(
+            render.path, "preset", expected=protocol.preset or "none, as the protocol says", found=used or "none",
+            fix="render with the protocol's preset, or name the render's in the protocol",
+        )  # fmt: skip
 
 
 def _by_camera(packs: list[FramePack]) -> dict[str, FramePack]:

@@ -87,6 +87,11 @@ def test_render_and_speed_take_presets_and_budgets(measured, tmp_path, capsys) -
     assert cli([*render, "--protocol", by_protocol]) == 0
     with FramePack(out) as pack:
         assert pack.read("rgb", pack.frames[0]).tobytes() == pictures["--preset fast"]
+    judge = ["evaluate", "--render", out, "--frames", measured["packs"][2], "--out", str(tmp_path / "e.json")]
+    judge += ["--cfg", json.dumps({"nets": [], "trivial": False})]
+    assert cli([*judge, "--protocol", by_protocol]) == 0
+    assert cli([*judge, "--protocol", protocol]) == 2
+    assert "preset: expected none, as the protocol says, found fast" in capsys.readouterr().err
     assert cli([*render, "--max-ms", "1e-6"]) == 2
     assert "--max-ms: expected a measured setting" in capsys.readouterr().err
     assert cli([*render, "--preset", "fats"]) == 2
@@ -124,7 +129,8 @@ def test_training_takes_order_and_window_from_a_preset(tmp_path) -> None:
 
 
 def test_savings_are_measured_on_and_off(measured) -> None:
-    assert sweep(*measured["words"], "--savings") == 0
+    once = json.dumps({**SHEET, "images": 1, "repeats": 1})
+    assert sweep(*measured["words"], "--sheet", once, "--savings") == 0
     rows = read_json(measured["folder"] / "out" / "savings.json")["rows"]
     by_name = {(row["saving"], row["scene"]): row for row in rows}
     window = by_name["region of interest", "avatar 8x smaller"]
