@@ -14,10 +14,10 @@ from torch import Tensor
 
 from nbavatar.raster import binning
 from nbavatar.raster.compile import run_workers
-from nbavatar.raster.projection import Projection as PatchProjection
 from nbavatar.splat import cpu_kernels
 from nbavatar.splat.compile import prepare
 from nbavatar.splat.lanes import LANES
+from nbavatar.splat.patches import patches_of
 from nbavatar.splat.projection import FAINTEST, Projection, support_box
 from nbavatar.splat.reference import SplatSettings
 
@@ -80,7 +80,7 @@ class _Scene:
         self.form = projection.form.detach().numpy()
         self.opacities, self.colours = opacities.detach().numpy(), colours.detach().numpy()
         reach, box = support_box(projection, opacities.detach(), s.alpha_min)
-        patches = _patches(projection.form.detach(), opacities.detach(), reach, box)
+        patches = patches_of(projection.form.detach(), opacities.detach(), reach, box)
         self.bins = binning.bin_billboards(patches, rank, 1, s.width, s.height, 1.0, torch.float64, by_nearest=False)
         limits = [0, 1, max(s.alpha_min, FAINTEST), s.alpha_max, s.t_min]
         self.limits = torch.tensor(limits, dtype=self.dtype).numpy()
@@ -146,18 +146,6 @@ class _Scene:
             return int(status[0])
 
         return sum(run_workers(work))
-
-
-def _patches(form: Tensor, opacities: Tensor, reach: Tensor, box: Tensor) -> PatchProjection:
-    """The Gaussians as the flat patches |u|, |v| <= reach that enclose them, for the tiles' lists.
-
-    Their "inverse depth" is `reach` everywhere, so a patch ends where its texture coordinates are 1.
-    """
-    p, s, k, x, y = form.unbind(-1)
-    zero = torch.zeros_like(p)
-    plane = torch.stack([p, s, -(p * x + s * y), zero, k, -k * y, zero, zero, reach], -1).reshape(-1, 3, 3)
-    ones = torch.ones_like(p)
-    return PatchProjection(plane, opacities.double(), ones, ones, box)
 
 
 @cache

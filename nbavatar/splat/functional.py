@@ -1,6 +1,7 @@
 """Public function of the Gaussian rasterizer: argument checks, projection, choice of the backend."""
 
 import importlib.util
+import os
 from typing import NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ from nbavatar.splat.spherical_harmonics import DEGREES, harmonic_colours, harmon
 __all__ = ["SplatImage", "render_gaussians"]
 
 _WHERE = "render_gaussians"
-_BACKENDS = ("auto", "reference", "cpu", "gsplat")
+_BACKENDS = ("auto", "reference", "cpu", "cuda", "gsplat")
 _LARGEST = 1e30  # of scales, whose fourth powers must stay finite
 
 
@@ -88,10 +89,10 @@ def render_gaussians(
         alpha_min: a smaller alpha is skipped.
         alpha_max: alpha is capped here; where it is, it passes no gradient on.
         t_min: a pixel is finished before its transmittance falls under this.
-        backend: `cpu` blends with our kernels, on the CPU (tensors on a GPU are projected there and
-            copied for it); `gsplat` takes that package, on a GPU, with the restrictions that
-            `nbavatar.splat.gsplat_backend` names; `auto` is `gsplat` for tensors on a GPU where it is
-            installed, else `cpu`; `reference` is the slow oracle, on any device.
+        backend: `cpu` and `cuda` blend with our kernels (tensors on a GPU are projected there and copied for
+            `cpu`); `gsplat` takes that package, on a GPU, with the restrictions that
+            `nbavatar.splat.gsplat_backend` names; `auto` is `cpu`, and on a GPU `gsplat` where it is installed,
+            else `cuda`; `reference` is the slow oracle, on any device.
 
     Returns:
         A SplatImage in the widest dtype of the first five tensors, at least float32. Gradients reach
@@ -100,7 +101,7 @@ def render_gaussians(
     Raises:
         DataError: a shape, dtype, device, option or value is wrong; one line says which.
         DeviceError: the backend asked for does not fit the tensors' device.
-        DependencyError: `gsplat` is asked for and not installed.
+        DependencyError: the backend's package, gsplat or numba-cuda, is missing.
     """
     _check_tensors(means, quats, scales, opacities, colours, viewmat, K, screen_offsets)
     _check_options(width, height, near, low_pass, alpha_min, alpha_max, t_min)
@@ -117,6 +118,8 @@ def render_gaussians(
         if means.device.type == "cpu":
             from nbavatar.splat.cpu_projection import harmonic_colours_cpu as shade
             from nbavatar.splat.cpu_projection import project_gaussians_cpu as project
+    elif backend == "cuda":
+        from nbavatar.splat.cuda import blend_cuda as blend  # a machine without CUDA never gets here
     rgb = colours
     if degree is not None:
         offsets = means.double() - camera_centre(viewmat.detach().double())
@@ -141,11 +144,12 @@ def _resolve(name: str, device: torch.device) -> str:
     """The backend that a name stands for on a device."""
     if name not in _BACKENDS:
         raise DataError.of(_WHERE, "backend", expected=f"one of {', '.join(_BACKENDS)}", found=repr(name))
+    on_gpu = device.type == "cuda"
     if name == "auto":
-        on_gpu = device.type == "cuda" and importlib.util.find_spec("gsplat") is not None
-        return "gsplat" if on_gpu else "cpu"
-    if name == "gsplat" and device.type != "cuda":
-        raise DeviceError.of(_WHERE, "backend", expected="tensors on cuda for 'gsplat'",
+        return "cpu" if not on_gpu else "cuda" if importlib.util.find_spec("gsplat") is None else "gsplat"
+    simulated = name == "cuda" and os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
+    if name in ("gsplat", "cuda") and not (on_gpu or simulated):
+        raise DeviceError.of(_WHERE, "backend", expected=f"tensors on cuda for '{name}'",
                              found=f"tensors on {device.type}")  # fmt: skip
     return name
 

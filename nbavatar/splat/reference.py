@@ -148,7 +148,8 @@ def critical_pixels(
     for members, x, y in _blocks(box, rank, s):
         raw = _alphas(projection.form[members], opacities[members].double(), x, y)
         _, behind, hit = _weights(raw, s)
-        close = (raw - s.alpha_min).abs() <= tolerance * max(s.alpha_min, FAINTEST)
+        least = max(s.alpha_min, FAINTEST)
+        close = (raw - least).abs() <= tolerance * least
         close |= hit & ((raw - s.alpha_max).abs() <= tolerance * s.alpha_max)
         close |= hit & ((behind - s.t_min).abs() <= 100 * tolerance * s.t_min)
         critical[y, x] = close.any(0)

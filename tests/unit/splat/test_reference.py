@@ -124,9 +124,7 @@ def mixed(colour, alpha, _):
     return torch.randn(8, len(values), generator=generator, dtype=torch.float64) @ values
 
 
-@pytest.mark.parametrize(
-    ("degree", "low_pass", "alpha_min"), [(None, 0.3, 0.0), (0, 0.0, 1 / 255), (1, 0.3, 0.0)]
-)
+@pytest.mark.parametrize(("degree", "low_pass", "alpha_min"), [(None, 0.3, 0.0), (0, 0.0, 1 / 255), (1, 0.3, 0.0)])
 def test_gradients_equal_finite_differences(degree, low_pass, alpha_min):
     scene = random_gaussians(7, count=3, degree=degree, size=(0.05, 0.4))
     view, K = turned_camera(5, 4, focal=5.0)
