@@ -101,8 +101,8 @@ class ContactSolver:
         self._hands = [_outwards(DeformingMesh(rest, faces), rest) for rest, faces in hands]
         self._count, self._hand_counts = len(head_rest), [len(rest) for rest, _ in hands]
         self._hand_edges = [edges(np.asarray(faces, np.int64)) for _, faces in hands]
-        mass = numbers.density * surface.area
-        self._inverse_mass = 1.0 / mass
+        # A vertex without mass would answer any force at once: it gets a little, far below that of a real one.
+        self._inverse_mass = 1.0 / np.maximum(numbers.density * surface.area, 1e-9)
         if pinned is not None:
             self._inverse_mass[pinned] = 0.0
         self._support = surface.bed * surface.area

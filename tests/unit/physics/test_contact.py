@@ -139,6 +139,12 @@ def test_any_time_step_resolves_contact(time_step):
     assert np.isfinite(result.head).all() and _depth(result.head, result.hands[0]) < 2e-4
 
 
+@pytest.mark.parametrize("density", [0.0, 1e-12, 1e6])
+def test_any_mass_resolves_contact(density):
+    result = _solver(density=density).solve(HEAD, [press(HAND, 0.006)])
+    assert np.isfinite(result.head).all() and _depth(result.head, result.hands[0]) < 2e-4
+
+
 def test_pinned_vertices_stay_and_what_is_left_is_said():
     pinned = np.arange(len(HEAD))
     result = _solver(pinned=pinned, hand_shift=0.002).solve(HEAD, [press(HAND, 0.01)])
