@@ -4,7 +4,8 @@ Window: Gaussian, 11 x 11, sigma 1.5 px, normalised to sum 1; K1 = 0.01, K2 = 0.
 correction (their eq. 14). Border: only windows that lie wholly inside the image count, so 5 px a side are cropped
 and nothing is padded. Colour: computed per channel of sRGB and averaged. This is what scikit-image computes with
 ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis``. (Gaussian splatting
-code bases pad with zeros instead: their values differ in the third digit on white backgrounds.)
+code bases pad with zeros instead: their values differ in the third digit on white backgrounds; torchmetrics gives the
+same map inside, to 1e-12, but averages a reflected border with it: 0.734 for 0.737 on a blurred photograph of 128 px.)
 
 Everything is computed in float64: E[x^2] - E[x]^2 loses its digits in float32 where images are flat.
 

@@ -13,6 +13,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 from skimage import data
+from skimage.transform import resize
 
 from nbavatar.errors import DataError, DependencyError
 from nbavatar.metrics import lpips as subject
@@ -216,3 +217,14 @@ def test_only_torch_and_numpy_are_imported():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(("net", "published"), [("alex", 0.28051915764808655), ("vgg", 0.35624152421951294)])
+def test_values_of_the_published_package(net, published):
+    # Package lpips 0.1.4 (its heads are bit for bit ours) on torchvision's own AlexNet and VGG16 with the same
+    # convolutions, once, on this pair; the metric's example photographs are not shipped with it.
+    sharp = resize(data.astronaut()[:256, :256] / 255.0, (128, 128)).astype(np.float32)
+    noise = 0.02 * np.random.default_rng(0).normal(size=sharp.shape)
+    blurred = np.clip(gaussian_filter(sharp, (1.5, 1.5, 0)) + noise, 0, 1).astype(np.float32)
+    pair = [torch.from_numpy(np.ascontiguousarray(v.transpose(2, 0, 1)))[None] for v in (sharp, blurred)]
+    assert float(load_lpips(net)(*pair)) == pytest.approx(published, abs=1e-5)
