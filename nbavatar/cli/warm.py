@@ -33,7 +33,7 @@ __all__ = ["SOCKET_VARIABLE", "add_arguments", "call", "main", "takes"]
 SOCKET_VARIABLE = "NBAVATAR_WARM"
 """Environment variable with the path of the socket; set for the command and everything below it."""
 
-_VERBS = frozenset({"train", "render", "evaluate", "speed"})
+_VERBS = frozenset({"train", "render", "evaluate", "speed", "tradeoff", "extremes", "video", "figure"})
 _LONGEST = 1 << 20  # bytes of a request: arguments and environment
 
 

@@ -10,13 +10,13 @@ from typing import Any
 
 from nbavatar.config.avatar import SpeedConfig, TrainConfig
 from nbavatar.config.core import from_mapping, merge, option, to_mapping
-from nbavatar.config.evaluation import EvaluateConfig, ProtocolConfig, ReportConfig, TableConfig
+from nbavatar.config.evaluation import EvaluateConfig, ProtocolConfig, ReportConfig, TableConfig, VideoConfig
 from nbavatar.config.geometry import DeformConfig, FitConfig, SpectralConfig
 from nbavatar.config.preprocess import CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
 from nbavatar.errors import ConfigError, did_you_mean
 
-__all__ = ["RunConfig", "Stages", "Variant", "load_run", "stage_options"]
+__all__ = ["RunConfig", "Stages", "TradeoffRun", "Variant", "load_run", "stage_options"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Stages:
     evaluate: EvaluateConfig = option(EvaluateConfig, "Metrics.")
     speed: SpeedConfig = option(SpeedConfig, "Timing.")
     table: TableConfig = option(TableConfig, "Tables.")
+    video: VideoConfig = option(VideoConfig, "Videos.")
     report: ReportConfig = option(ReportConfig, "HTML report.")
 
 
@@ -50,6 +51,15 @@ class Variant:
 
 
 @dataclasses.dataclass(frozen=True)
+class TradeoffRun:
+    """Sweeps of speed against accuracy (`nbavatar tradeoff`)."""
+
+    sheet: str = option("config/tradeoff.yaml", "Knobs and values.")
+    variants: list[str] = option([], "Variants to sweep, for the first subject that has them; none by default.")
+    protocol: str = option("nv1024", "Protocol whose images judge quality.")
+
+
+@dataclasses.dataclass(frozen=True)
 class RunConfig:
     """Everything that one configuration file says."""
 
@@ -62,6 +72,15 @@ class RunConfig:
     runs: str = option("config/runs.tsv", "Sheet of what to make: subject, variant, protocol.")
     tables: str = option("config/tables.yaml", "Layout of the tables.")
     reported: str = option("config/reported.csv", "Numbers printed in the paper.")
+    figures: str = option("config/figures.yaml", "Layout of the figures; empty for none.")
+    videos: list[str] = option([], "Variants of which a turntable and a driven video are made, for every subject.")
+    reenact: list[str] = option([], "Pairs source/target of subjects: the source is shown in the target's poses.")
+    tradeoff: TradeoffRun = option(TradeoffRun, "Speed against accuracy.")
+    extremes: str = option(
+        "",
+        "Also drive every kernel to its limits: quick, full, or empty for not in this run.",
+        choices=("", "quick", "full"),
+    )
     device: str = option("auto", "Device of training, rendering and timing.", choices=("auto", "cpu", "cuda"))
     size_label: str = option(
         "", "What is said in every table caption when sizes are not the paper's, such as 'smoke size, 64 px'."
@@ -92,6 +111,15 @@ def load_run(mapping: Mapping[str, Any], where: str = "config") -> RunConfig:
     ]:
         if crop not in run.crops:
             raise ConfigError(f"{where}.{name}.crop: unknown crop '{crop}'; {did_you_mean(crop, run.crops)}")
+    for name in (*run.videos, *run.tradeoff.variants):
+        if name not in run.variants:
+            raise ConfigError(f"{where}: unknown variant '{name}'; {did_you_mean(name, run.variants)}")
+    if run.tradeoff.variants and run.tradeoff.protocol not in run.protocols:
+        name = run.tradeoff.protocol
+        raise ConfigError(f"{where}.tradeoff.protocol: unknown protocol '{name}'; {did_you_mean(name, run.protocols)}")
+    for pair in run.reenact:
+        if pair.count("/") != 1:
+            raise ConfigError.of(f"{where}.reenact", expected="pairs source/target", found=repr(pair))
     stages = {field.name for field in dataclasses.fields(Stages)}
     for name, variant in run.variants.items():
         for stage in variant.stages:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 from snakemake.exceptions import WorkflowError
 
+from nbavatar.config.figures import read_figures
 from nbavatar.config.run import load_run, stage_options
 from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
 from nbavatar.config.tables import read_tables
@@ -31,6 +32,13 @@ try:
                     f"{RUN.runs}: unknown {kind} '{name}'; {did_you_mean(name, known)}"
                 )
     TABLES = read_tables(RUN.tables)
+    FIGURES = read_figures(RUN.figures) if RUN.figures else {}
+    for pair in RUN.reenact:
+        for name in pair.split("/"):
+            if name not in SUBJECTS:
+                raise NBAvatarError(
+                    f"reenact: unknown subject '{name}'; {did_you_mean(name, SUBJECTS)}"
+                )
 except NBAvatarError as error:
     raise WorkflowError(str(error)) from None
 
@@ -49,6 +57,10 @@ wildcard_constraints:
     variant="|".join(RUN.variants),
     protocol="|".join(RUN.protocols),
     table="|".join(TABLES),
+    figure="|".join(FIGURES),
+    source="|".join(SUBJECTS),
+    target="|".join(SUBJECTS),
+    kind="driven|turntable",
 
 
 def options(stage):
@@ -67,13 +79,14 @@ def crop_options(wildcards):
     return json.dumps(to_mapping(RUN.crops[wildcards.crop]), sort_keys=True)
 
 
-def protocol_options(wildcards):
+def protocol_text(name):
     from nbavatar.config.core import to_mapping
 
-    values = to_mapping(RUN.protocols[wildcards.protocol]) | {
-        "name": wildcards.protocol
-    }
-    return json.dumps(values, sort_keys=True)
+    return json.dumps(to_mapping(RUN.protocols[name]) | {"name": name}, sort_keys=True)
+
+
+def protocol_options(wildcards):
+    return protocol_text(wildcards.protocol)
 
 
 def data_root(wildcards):
@@ -170,12 +183,16 @@ def train_frames(wildcards):
 
 def meshes_of(wildcards):
     """The meshes that carry a variant."""
-    stage = RUN.variants[wildcards.variant].meshes
+    return meshes_for(wildcards.subject, wildcards.variant)
+
+
+def meshes_for(subject, variant):
+    stage = RUN.variants[variant].meshes
     if RUN.layout == "capture" and (
         stage == "fit" or RUN.stages.tracks.contact == "given"
     ):
         stage = "tracks"
-    return f"{R}/{stage}/{wildcards.subject}.npz"
+    return f"{R}/{stage}/{subject}.npz"
 
 
 def fitted(wildcards):
@@ -184,16 +201,19 @@ def fitted(wildcards):
     return f"{R}/{stage}/{wildcards.subject}.npz"
 
 
-def protocol_frames(wildcards):
+def frames_under(protocol, subject):
     """Crops that a protocol looks at: the held-out camera for novel views, the training cameras for held-out poses."""
-    protocol = RUN.protocols[wildcards.protocol]
-    subject = SUBJECTS[wildcards.subject]
+    protocol, cameras = RUN.protocols[protocol], SUBJECTS[subject]
     cameras = (
-        [subject.test_camera]
+        [cameras.test_camera]
         if protocol.split == "novel_view"
-        else subject.train_cameras
+        else cameras.train_cameras
     )
-    return crops_of(wildcards, wildcards.variant, protocol.crop, cameras)
+    return [f"{R}/crop/{protocol.crop}/{subject}/{camera}.zip" for camera in cameras]
+
+
+def protocol_frames(wildcards):
+    return frames_under(wildcards.protocol, wildcards.subject)
 
 
 def protocol_train_frames(wildcards):
@@ -251,7 +271,91 @@ def report_pictures():
     ]
 
 
+def figure_rows(name):
+    """Rows of the sheet that a figure shows: its variants, or those whose avatars stand for all subjects."""
+    layout = FIGURES[name]
+    return [
+        row
+        for row in ROWS
+        if layout.shows(row.subject)
+        and row.protocol == layout.protocol
+        and (row.variant in layout.variants or not layout.variants)
+    ]
+
+
+def figure_files(name, what):
+    """What a figure needs of one kind."""
+    layout, rows = FIGURES[name], figure_rows(name)
+    subjects = list(dict.fromkeys(row.subject for row in rows))
+    pairs = [pair.split("/") for pair in RUN.reenact]
+    shown = [(s, t) for s, t in pairs if (s, layout.variant) in avatars()]
+    needs = {
+        "comparison": ("renders", "frames", "evals"),
+        "features": ("models", "sequences", "frames"),
+        "reenactment": ("models", "sequences", "frames"),
+        "contact": ("sequences", "frames"),
+        "curves": ("histories",),
+        "pareto": ("evals", "speeds"),
+    }[layout.kind]
+    if what not in needs:
+        return []
+    if what == "renders":
+        return renders_of(rows)
+    if what == "evals":
+        return evals_of(rows)
+    if what == "speeds":
+        return [f"{R}/speed/{s}/{v}.json" for s, v in timed_avatars(rows)]
+    if what == "histories":
+        return [f"{R}/train/{s}/{v}/history.jsonl" for s, v in avatars()]
+    if layout.kind == "reenactment":
+        sources = list(dict.fromkeys(source for source, _ in shown))
+        if what == "models":
+            return [f"{R}/train/{s}/{layout.variant}/model.pt" for s in sources]
+        if what == "sequences":
+            return [f"{R}/reenact/{s}/{t}.npz" for s, t in shown]
+        subjects = list(dict.fromkeys(name for pair in shown for name in pair))
+    if what == "models":
+        return [f"{R}/train/{s}/{layout.variant}/model.pt" for s in subjects]
+    if what == "sequences":
+        return [meshes_for(s, layout.variant) for s in subjects]
+    return sorted({f for s in subjects for f in frames_under(layout.protocol, s)})
+
+
+def timed_avatars(rows):
+    """Of these rows, the avatars that some table times: timing takes the machine for itself, so no more than needed."""
+    timed = {path for table in TABLES for path in speeds_of(table)}
+    return [
+        (row.subject, row.variant)
+        for row in rows
+        if f"{R}/speed/{row.subject}/{row.variant}.json" in timed
+    ]
+
+
+def videos():
+    return [
+        f"{R}/video/{subject}/{variant}/{kind}.mp4"
+        for subject, variant in avatars()
+        if variant in RUN.videos
+        for kind in ("turntable", "driven")
+    ]
+
+
+def tradeoffs():
+    first = {}
+    for subject, variant in avatars():
+        if variant in RUN.tradeoff.variants:
+            first.setdefault(variant, subject)
+    return [
+        f"{R}/tradeoff/{subject}/{variant}/tradeoff.json"
+        for variant, subject in first.items()
+    ]
+
+
 EVERYTHING = [
+    *videos(),
+    *tradeoffs(),
+    *([f"{R}/extremes/table.md"] if RUN.extremes else []),
+    *(f"{R}/figures/{figure}.png" for figure in FIGURES),
     *evals_of(ROWS),
     *(
         f"{R}/tables/{table}.{suffix}"

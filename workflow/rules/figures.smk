@@ -1,0 +1,90 @@
+"""Figures for print, cross-reenactment and videos.
+
+REQUIRED INPUTS: results/{run}/{render,eval,speed,train,crop}/**, meshes, config/figures.yaml
+OUTPUTS: results/{run}/figures/{figure}.{png,pdf,json}, results/{run}/reenact/{source}/{target}.npz,
+         results/{run}/video/{subject}/{variant}/{kind}.mp4
+"""
+
+
+rule reenact:
+    input:
+        source=lambda w: meshes_for(w.source, "full"),
+        target=lambda w: meshes_for(w.target, "full"),
+    output:
+        "results/{run}/reenact/{source}/{target}.npz",
+    log:
+        "logs/{run}/reenact/{source}/{target}.log",
+    resources:
+        mem="8GB",
+        runtime="1h",
+    params:
+        assets=lambda w: (
+            f"--assets {Path(RUN.data_root) / 'assets'}"
+            if RUN.layout == "decaf"
+            else ""
+        ),
+        code=code_digest("reenact"),
+    shell:
+        "nbavatar reenact --source {input.source} --target {input.target} {params.assets}"
+        " --out {output} > {log} 2>&1"
+
+
+rule video:
+    input:
+        model="results/{run}/train/{subject}/{variant}/model.pt",
+        meshes=meshes_of,
+        camera=lambda w: crops_of(w, w.variant)[0],
+    output:
+        video=report(
+            "results/{run}/video/{subject}/{variant}/{kind}.mp4",
+            category="Videos",
+            caption="../report/video.rst",
+        ),
+        record="results/{run}/video/{subject}/{variant}/{kind}.mp4.json",
+    log:
+        "logs/{run}/video/{subject}/{variant}/{kind}.log",
+    threads: 4
+    resources:
+        gpu=1,
+        mem="8GB",
+        runtime="2h",
+    params:
+        device=RUN.device,
+        cfg=options("video"),
+        code=code_digest("video"),
+    shell:
+        "nbavatar video --model {input.model} --meshes {input.meshes} --camera {input.camera} --kind {wildcards.kind}"
+        " --out {output.video} --device {params.device} --cfg {params.cfg:q} > {log} 2>&1"
+
+
+# A figure asks for the results that it shows, and for no others.
+rule figure:
+    input:
+        layout=RUN.figures,
+        renders=lambda w: figure_files(w.figure, "renders"),
+        frames=lambda w: figure_files(w.figure, "frames"),
+        evals=lambda w: figure_files(w.figure, "evals"),
+        speeds=lambda w: figure_files(w.figure, "speeds"),
+        histories=lambda w: figure_files(w.figure, "histories"),
+        models=lambda w: figure_files(w.figure, "models"),
+        sequences=lambda w: figure_files(w.figure, "sequences"),
+    output:
+        png=report(
+            "results/{run}/figures/{figure}.png",
+            category="Figures",
+            caption="../report/figure.rst",
+        ),
+        pdf="results/{run}/figures/{figure}.pdf",
+        record="results/{run}/figures/{figure}.json",
+    log:
+        "logs/{run}/figures/{figure}.log",
+    resources:
+        mem="8GB",
+        runtime="30m",
+    params:
+        stem=lambda w, output: output.png[:-4],
+        code=code_digest("figure"),
+    shell:
+        "nbavatar figure --figure {wildcards.figure} --layout {input.layout} --renders {input.renders}"
+        " --frames {input.frames} --evals {input.evals} --speeds {input.speeds} --histories {input.histories}"
+        " --models {input.models} --sequences {input.sequences} --out-stem {params.stem} > {log} 2>&1"
