@@ -6,8 +6,10 @@
 Figures: medians of wall time [ms], and of processor time over all threads (`*_cpu_ms`), which other
 programs on the machine disturb less; `samples` are the billboard hits blended into the image;
 `max_abs_error` and `max_grad_rel_error` are against the float64 reference, off the `flipped_pixels`,
-where rounding flips a decision (skip, stop, which hit is nearer); `peak_mb` is what rendering forward and
-backward added to the process's largest memory; `compile_s` the time until the kernels were ready;
+where rounding flips a decision (skip, stop, which hit is nearer), on the window `reference_window` (x, y,
+width, height) of the image, at its full density; `reference_forward_ms` is for that window too; `peak_mb` is what
+rendering forward and backward added to the process's memory at its largest; `compile_s` the time until the
+kernels were ready;
 `order_differs` the share of pixels on which the other orders differ from `ray` by more than 1/255.
 On a GPU `forward_ms` is the whole public function, projection included, and `blend_ms`,
 `blend_backward_ms` are the device's own time in the kernels of the blending alone (binning included),
@@ -15,7 +17,7 @@ by its event clock; `samples` are still counted by the CPU's kernels.
 """
 
 import argparse
-import csv
+import contextlib
 import statistics
 import time
 from collections.abc import Callable
@@ -48,6 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="(default: %(default)s)")
     parser.add_argument("--repeats", type=int, default=7, help="runs a median is taken of (default: %(default)s)")
     parser.add_argument("--no-reference", action="store_true", help="skip the slow comparison; its figures are null")
+    parser.add_argument("--window", type=int, default=256, help="side of the part of the image that is compared with "
+                        "the reference, about its centre [px]; 0 for all of it (default: %(default)s)")  # fmt: skip
     parser.add_argument("--orders", action="store_true", help="also compare the orders with ray")
     parser.add_argument("--sweep", type=Path, help="folder for a sweep's table and plots")
 
@@ -76,16 +80,21 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     _render(tiny, args.order)
     figures: dict[str, Any] = {"compile_s": time.perf_counter() - start}
     figures |= measure(scene, args.order, args.repeats)
-    figures |= {"reference_forward_ms": None, "max_abs_error": None, "flipped_pixels": None, "max_grad_rel_error": None}
+    figures |= {"reference_forward_ms": None, "max_abs_error": None, "flipped_pixels": None, "max_grad_rel_error": None,
+                "reference_window": None}  # fmt: skip
     if not args.no_reference:
-        figures |= compare(scene, args.order)
+        window, start_at = crop(scene, args.window or args.size)
+        figures |= compare(window, args.order)
+        figures["reference_window"] = [start_at, start_at, window.size, window.size]
     if args.orders:
         figures["order_differs"] = order_differences(scene)
     figures |= {"threads": torch.get_num_threads(), "device": _device_name(args.device), "order": args.order,
                 "billboards": len(scene.means), "channels": args.channels, "size": args.size,
                 "state": args.state}  # fmt: skip
     if args.sweep is not None:
-        sweep(args.sweep, args.order, args.state, args.repeats, args.device)
+        from nbavatar.benchmarks.raster_sweep import sweep
+
+        sweep(args.sweep, args.order, args.state, args.repeats, args.device, measure)
     return figures
 
 
@@ -119,16 +128,28 @@ def _median_ms(action: Callable[[], Any], repeats: int, device: str) -> tuple[fl
     return statistics.median(wall), statistics.median(processor)
 
 
-def _peak_mb() -> float:
-    import resource
+def _memory_mb(entry: str) -> float:
+    """What the system says of this process's memory: VmRSS now, VmHWM at its largest [MiB]."""
+    try:
+        with open("/proc/self/status") as handle:
+            return next(int(line.split()[1]) / 1024 for line in handle if line.startswith(entry))
+    except (OSError, StopIteration):
+        import resource
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def _forget_peak() -> None:
+    """Has the largest memory counted anew from here, where the system can."""
+    with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as handle:
+        handle.write("5")
 
 
 def measure(scene: RasterScene, order: str, repeats: int) -> dict[str, Any]:
     """Times of the forward and the backward pass, and what they blend and take."""
     device = scene.means.device.type
-    before = _peak_mb()
+    _forget_peak()
+    before = _memory_mb("VmRSS")
     with torch.no_grad():
         forward, forward_cpu = _median_ms(lambda: _render(scene, order), repeats, device)
     leaves = [tensor.detach().clone().requires_grad_() for tensor in scene.billboards]
@@ -139,7 +160,7 @@ def measure(scene: RasterScene, order: str, repeats: int) -> dict[str, Any]:
     backward, backward_cpu = _median_ms(
         lambda: torch.autograd.grad(outputs, leaves, grads, retain_graph=True), max(3, repeats // 2), device
     )
-    peak = torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else _peak_mb() - before
+    peak = torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else _memory_mb("VmHWM") - before
     device_times = _blend_times(scene, order, repeats) if device == "cuda" else {}
     samples = _samples(scene, order)
     return {
@@ -217,6 +238,15 @@ def _samples(scene: RasterScene, order: str) -> int:
     return count_samples(projection, rank, host.features, host.alpha, _blend_settings(host, order))
 
 
+def crop(scene: RasterScene, side: int) -> tuple[RasterScene, int]:
+    """The scene seen through a square window about the image's centre, and the window's first column and row."""
+    side = min(side, scene.size)
+    start = (scene.size - side) // 2
+    K = scene.K.clone()
+    K[:2, 2] -= start
+    return RasterScene(*scene.billboards, scene.viewmat, K, side), start
+
+
 def compare(scene: RasterScene, order: str) -> dict[str, Any]:
     """Values and gradients against the float64 reference on the CPU."""
     leaves = [tensor.detach().clone().requires_grad_() for tensor in scene.billboards]
@@ -256,38 +286,3 @@ def order_differences(scene: RasterScene) -> dict[str, float]:
         other, _ = _render(scene, order)
         shares[order] = float(((other - exact).abs().amax(0) > 1 / 255).sum()) / max(1, covered)
     return shares
-
-
-def sweep(folder: Path, order: str, state: str, repeats: int, device: str) -> None:
-    """Writes `raster_sweep.csv` and `raster_sweep.png`: cost against each size, the others as by default."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    ranges: dict[str, list[int]] = {
-        "billboards": [1000, 3000, 10000, 30000, 100000], "channels": [3, 6, 12, 24, 32],
-        "texels": [4, 8, 16, 32], "size": [256, 512, 1024, 2048],
-    }  # fmt: skip
-    rows = []
-    for name, values in ranges.items():
-        for value in values:
-            settings: dict[str, Any] = {name: value}
-            figures = measure(make_scene(state=state, **settings).to(device), order, repeats)
-            rows.append({"swept": name, "value": value, **figures})
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "raster_sweep.csv", "w", newline="") as handle:
-        writer = csv.DictWriter(handle, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    figure, axes = plt.subplots(1, len(ranges), figsize=(4 * len(ranges), 3.4), sharey=True, constrained_layout=True)
-    for axis, (name, values) in zip(axes, ranges.items(), strict=True):
-        chosen = [row for row in rows if row["swept"] == name]
-        for key, label in (("forward_ms", "forward"), ("backward_ms", "backward")):
-            axis.loglog(values, [row[key] for row in chosen], "o-", label=label)
-        axis.set_xlabel(name)
-        axis.grid(True, which="both", alpha=0.3)
-    axes[0].set_ylabel("time [ms]")
-    axes[0].legend()
-    figure.savefig(folder / "raster_sweep.png", dpi=120)
-    plt.close(figure)

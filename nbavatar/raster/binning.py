@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from nbavatar.errors import DeviceError
 from nbavatar.raster.compile import kernel
+from nbavatar.raster.lanes import LANES
 from nbavatar.raster.projection import Projection
 
 __all__ = ["RECORD", "TILE_HEIGHT", "TILE_WIDTH", "Bins", "bin_billboards", "require_memory"]
@@ -38,7 +39,7 @@ class Bins:
         where: (E,) int64, its position in the tile-major lists.
         start: (tiles + 1,) int64, list of each tile.
         members: (E,) int32, the tile-major lists: billboards.
-        offset: (E + 1,) int64, pixels of all earlier members' boxes within their tiles.
+        room: (tiles,) int64, most groups of `LANES` neighbouring pixels that the billboards of a tile can fill.
     """
 
     record: NDArray
@@ -50,7 +51,7 @@ class Bins:
     where: NDArray[np.int64]
     start: NDArray[np.int64]
     members: NDArray[np.int32]
-    offset: NDArray[np.int64]
+    room: NDArray[np.int64]
 
 
 @kernel
@@ -132,7 +133,7 @@ def count_entries(plane, box, sequence, support, first):
 
 
 @kernel
-def fill_entries(plane, box, sequence, support, tiles_across, first, tile, where, start, members, offset):
+def fill_entries(plane, box, sequence, support, tiles_across, first, tile, where, start, members, room):
     """Fills the lists of both orders; see `Bins`."""
     start[:] = 0
     for k in range(len(sequence)):
@@ -159,16 +160,14 @@ def fill_entries(plane, box, sequence, support, tiles_across, first, tile, where
     for t in range(len(start) - 1, 0, -1):
         start[t] = start[t - 1]
     start[0] = 0
-    total = 0
     for t in range(len(start) - 1):
         left, top = t % tiles_across * TILE_WIDTH, t // tiles_across * TILE_HEIGHT
+        room[t] = 0
         for position in range(start[t], start[t + 1]):
             i = members[position]
-            offset[position] = total
             across = min(box[i, 2], left + TILE_WIDTH) - max(box[i, 0], left)
             down = min(box[i, 3], top + TILE_HEIGHT) - max(box[i, 1], top)
-            total += across * down
-    offset[start[len(start) - 1]] = total
+            room[t] += (across + LANES - 1) // LANES * down
 
 
 def bin_billboards(
@@ -214,12 +213,12 @@ def bin_billboards(
     first = np.zeros(count + 1, np.int64)
     count_entries(plane, box, sequence, support, first)
     entries = int(first[-1])
-    require_memory(entries * 24 + across * down * 8, f"the tile lists of {count} billboards ({entries} entries)")
+    require_memory(entries * 16 + across * down * 8, f"the tile lists of {count} billboards ({entries} entries)")
     tile, members = np.zeros(entries, np.int32), np.zeros(entries, np.int32)
-    where, offset = np.zeros(entries, np.int64), np.zeros(entries + 1, np.int64)
-    start = np.zeros(across * down + 1, np.int64)
-    fill_entries(plane, box, sequence, support, across, first, tile, where, start, members, offset)
-    return Bins(record, box, sequence, place, first, tile, where, start, members, offset)
+    where = np.zeros(entries, np.int64)
+    start, room = np.zeros(across * down + 1, np.int64), np.zeros(across * down, np.int64)
+    fill_entries(plane, box, sequence, support, across, first, tile, where, start, members, room)
+    return Bins(record, box, sequence, place, first, tile, where, start, members, room)
 
 
 def available_memory() -> int:

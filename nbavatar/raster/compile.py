@@ -33,7 +33,10 @@ _LOG = logging.getLogger("nbavatar.raster")
 # Contraction and reassociation only: comparisons with NaN and infinity must keep their meaning.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
-_SOURCES = ("binning.py", "compile.py", "cpu_kernels.py", "memory.py", "scalar.py", "vector.py")
+_SOURCES = (
+    "binning.py", "compile.py", "cpu_blend.py", "cpu_gather.py", "cpu_hits.py", "cpu_pixels.py", "cpu_queue.py",
+    "lanes.py", "memory.py", "scalar.py",
+)  # fmt: skip
 
 
 _HERE = Path(__file__).parent
@@ -114,7 +117,9 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compiles a function that its caller absorbs."""
-    return njit(nogil=True, fastmath=FAST, error_model="numpy", forceinline=True)(function)
+    return njit(
+        nogil=True, fastmath=FAST, error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
+    )(function)
 
 
 @contextlib.contextmanager

@@ -4,23 +4,26 @@ Deterministic: the same inputs give the same bytes, forward and backward, whatev
 threads.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numba import types
 from torch import Tensor
 
-from nbavatar.raster import binning, cpu_kernels
+from nbavatar.raster import binning, cpu_blend, cpu_gather, cpu_pixels
 from nbavatar.raster.binning import bin_billboards, require_memory
 from nbavatar.raster.compile import prepare, run_workers
+from nbavatar.raster.cpu_hits import write_limits
+from nbavatar.raster.lanes import LANES
 from nbavatar.raster.projection import Projection
 from nbavatar.raster.reference import BlendSettings
-from nbavatar.raster.vector import LANES
 
 __all__ = ["blend_cpu", "count_samples"]
 
 _QUEUE = 32  # hits that may wait at a pixel; a tile that needs more is done again with room for all
-_NOTES = 1 << 26  # hits noted at once in the backward pass: 512 MiB in float32
-_SCRATCH = 1 << 26  # bytes of queues a worker may use; fewer rows are worked on at once beyond it
+_NOTES = 1 << 23  # groups of hits noted at once in the backward pass: 576 MiB in float32
+_SCRATCH = 1 << 26  # bytes that a worker may use; fewer rows are worked on at once beyond it
 
 
 def blend_cpu(
@@ -62,8 +65,18 @@ def count_samples(
 ) -> int:
     """Number of hits that are blended into the image."""
     scene = _Scene(projection, rank, features.detach(), alpha.detach(), settings)
-    grads = torch.zeros(settings.height, settings.width, features.shape[-1] + 1, dtype=alpha.dtype)
-    return scene.replay(grads)
+    scene.forward()
+    return scene.samples
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """Tiles that are worked on with queues of the same capacity, `rows` rows at once."""
+
+    tiles: np.ndarray
+    capacity: int
+    rows: int
+    groups: int
 
 
 class _Scene:
@@ -75,139 +88,155 @@ class _Scene:
         s = self.settings = settings
         self.dtype = alpha.dtype
         self.texels, self.channels, self.count = alpha.shape[-1], features.shape[-1], len(alpha)
+        self.stride = -(-self.channels // LANES) * LANES
         _prepare(self.dtype)
         self.features, self.alpha = features.detach().view(-1).numpy(), alpha.detach().view(-1).numpy()
         self.bins = bin_billboards(
             projection, rank, self.texels, s.width, s.height, s.support, self.dtype, by_nearest=s.queue < 0
         )
-        limits = [0, 1, self.texels, min(1, self.texels - 1), 1 / s.near, s.alpha_min, s.t_min, s.alpha_max]
-        self.limits = torch.tensor(limits, dtype=self.dtype).numpy()
+        real = np.float32 if self.dtype == torch.float32 else np.float64
+        self.limits = write_limits(self.texels, s.near, s.alpha_min, s.t_min, s.alpha_max, real)
         self.across = -(-s.width // binning.TILE_WIDTH)
         self.lengths = np.diff(self.bins.start)
-        self.areas = np.diff(self.bins.offset[self.bins.start])
+        self.made = np.zeros(len(self.lengths) + 1, np.int64)
+        self.passes: list[_Pass] = []
+        self.samples = 0
 
     def forward(self) -> tuple[Tensor, Tensor]:
+        """Blends all tiles, those whose queues were too short a second time."""
         s = self.settings
+        pixels = s.width * s.height
+        require_memory(pixels * (self.channels + 1) * self.limits.itemsize, f"an image of {s.width}x{s.height} pixels")
         image = torch.empty(self.channels, s.height, s.width, dtype=self.dtype)
         opacity = torch.empty(s.height, s.width, dtype=self.dtype)
         nothing = np.zeros(0, self.limits.dtype)
+        results = (image.view(-1).numpy(), opacity.view(-1).numpy())
+        whole = np.zeros(0, np.int32)
         tiles = np.arange(len(self.lengths), dtype=np.int32)
-        self._traverse(tiles, image.numpy(), opacity.numpy(), nothing, nothing, 0, replay=False)
+        longest = int(self.lengths.max(initial=1))
+        capacity = min(longest, _QUEUE if s.queue < 0 else s.queue + 1)
+        while len(tiles):
+            plan = self._plan(tiles, capacity)
+            states = self._run(plan, False, *results, nothing, nothing, nothing, whole, whole, 0)
+            broken = max((int(state[1]) for state in states), default=0)
+            if broken:
+                _complain(broken - 1)
+            self.samples += sum(int(state[2]) for state in states)
+            again = np.sort(np.concatenate([state[3 : 3 + state[0]] for state in states])).astype(np.int32)
+            self.passes.append(_Pass(np.setdiff1d(tiles, again), plan.capacity, plan.rows, plan.groups))
+            tiles = again
+            capacity = int(self.lengths[tiles].max(initial=1))
         return image, opacity
 
     def backward(self, grad_image: Tensor, grad_opacity: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Gradients by features, alpha, plane and fade."""
         s = self.settings
-        shape = (self.count, self.texels, self.texels)
-        grad_features = torch.empty(*shape, self.channels, dtype=self.dtype)
-        grad_alpha = torch.empty(shape, dtype=self.dtype)
+        size = self.limits.itemsize
+        texels = self.count * self.texels**2
+        require_memory(
+            texels * (self.channels + 1) * size + s.width * s.height * (self.stride + 1) * size,
+            f"the gradients of {self.count} billboards",
+        )
+        grad_features = torch.empty(self.count, self.texels, self.texels, self.channels, dtype=self.dtype)
+        grad_alpha = torch.empty(self.count, self.texels, self.texels, dtype=self.dtype)
         grad_plane = torch.empty(self.count, 3, 3, dtype=torch.float64)
         grad_fade = torch.empty(self.count, dtype=torch.float64)
-        grads = torch.empty(s.height, s.width, self.channels + 1, dtype=self.dtype)
-        grads[..., :-1] = grad_image.permute(1, 2, 0)
-        grads[..., -1] = grad_opacity
-        outputs = (grad_features.view(-1), grad_alpha.view(-1), grad_plane, grad_fade)
-        self.replay(grads, tuple(tensor.numpy() for tensor in outputs))
+        grads = torch.empty(s.height, s.width, self.stride, dtype=self.dtype)
+        grads[..., self.channels :] = 0
+        grads[..., : self.channels] = grad_image.permute(1, 2, 0)
+        covers = grad_opacity.to(self.dtype).contiguous().view(-1).numpy()
+        outputs = (grad_features.view(-1).numpy(), grad_alpha.view(-1).numpy(), grad_plane.numpy(), grad_fade.numpy())
+        self._replay(grads.view(-1).numpy(), covers, outputs)
         return grad_features, grad_alpha, grad_plane, grad_fade
 
-    def replay(self, grads: Tensor, outputs: tuple[np.ndarray, ...] | None = None) -> int:
-        """Repeats the blending, group of tiles by group of tiles, and fills the gradients `outputs`.
-
-        Returns:
-            Number of hits blended.
-        """
+    def _replay(self, grads: np.ndarray, covers: np.ndarray, outputs: tuple[np.ndarray, ...]) -> None:
+        """Repeats the blending, range of tiles by range of tiles, and fills the gradients `outputs`."""
         b = self.bins
-        flat = grads.view(-1).numpy()
-        groups = self._groups()
-        largest = max((int(b.offset[b.start[end]] - b.offset[b.start[first]]) for first, end in groups), default=0)
-        require_memory(2 * largest * self.limits.itemsize, f"the notes of {largest} hits in the backward pass")
-        notes = torch.empty(2 * largest, dtype=self.dtype).numpy()
-        no_image, no_opacity = np.zeros((0, 0, 0), self.limits.dtype), np.zeros((0, 0), self.limits.dtype)
-        samples = 0
-        for number, (first, end) in enumerate(groups):
-            base = int(b.offset[b.start[first]])
-            tiles = np.arange(first, end, dtype=np.int32)
-            samples += self._traverse(tiles, no_image, no_opacity, flat, notes, base, replay=True)
-            if outputs is not None:
-                turn = np.zeros(1, np.int64)
-                shape = self._shape(0, 0, replay=True)
+        first_group = np.concatenate([[0], np.cumsum(self.made[:-1])])
+        parts = _divide(first_group)
+        largest = max((int(first_group[end] - first_group[first]) for first, end in parts), default=0)
+        bands = max((-(-binning.TILE_HEIGHT // plan.rows) for plan in self.passes), default=1)
+        entries = len(b.members)
+        require_memory(
+            largest * (2 * LANES * self.limits.itemsize + 8) + bands * entries * 8,
+            f"the notes of {largest * LANES} hits in the backward pass",
+        )
+        notes = torch.empty(2 * LANES * largest, dtype=self.dtype).numpy()
+        spots = torch.empty(2 * largest, dtype=torch.int32).numpy()
+        nothing = np.zeros(0, self.limits.dtype)
+        shape = np.array([self.texels, self.channels, self.settings.width], np.int64)
+        for number, (first, end) in enumerate(parts):
+            ranges = np.zeros(2 * bands * entries, np.int32)
+            base = int(first_group[first])
+            for plan in self.passes:
+                chosen = plan.tiles[(plan.tiles >= first) & (plan.tiles < end)]
+                part = _Pass(chosen, plan.capacity, plan.rows, plan.groups)
+                self._run(part, True, nothing, nothing, grads, covers, notes, spots, ranges, base, first_group)
+            turn = np.zeros(1, np.int64)
 
-                def work(_: int, first=first, end=end, base=base, fresh=number == 0, turn=turn, shape=shape) -> None:
-                    cpu_kernels.collect(
-                        turn, 16, first, end, b.sequence, b.first, b.tile, b.where, b.start, b.offset,
-                        b.record.reshape(-1), b.box, self.features, self.alpha, self.limits, shape, flat, notes, base,
-                        fresh, *outputs,
-                    )  # fmt: skip
+            def work(_: int, first=first, end=end, base=base, fresh=number == 0, turn=turn, ranges=ranges) -> None:
+                cpu_gather.gather_gradients(
+                    turn, 16, first, end, bands, b.sequence, b.first, b.tile, b.where, ranges, first_group, notes,
+                    spots, base, b.record.reshape(-1), b.box, self.features, self.alpha, self.limits, shape, grads,
+                    fresh, *outputs,
+                    torch.empty(cpu_gather.scratch_size(self.texels, self.channels), dtype=self.dtype).numpy(),
+                )  # fmt: skip
 
-                run_workers(work)
-        return samples
+            run_workers(work)
 
-    def _groups(self) -> list[tuple[int, int]]:
-        """Consecutive tiles whose hits can be noted together."""
-        groups, first, held = [], 0, 0
-        for tile, area in enumerate(self.areas.tolist()):
-            if held and held + area > _NOTES:
-                groups.append((first, tile))
-                first, held = tile, 0
-            held += area
-        groups.append((first, len(self.areas)))
-        return groups
+    def _plan(self, tiles: np.ndarray, capacity: int) -> _Pass:
+        """How many rows to work on at once."""
+        longest = int(self.lengths[tiles].max(initial=0))
+        most = int(self.bins.room[tiles].max(initial=0))
+        rows = binning.TILE_HEIGHT
+        while True:
+            groups = min(most, longest * rows * (binning.TILE_WIDTH // LANES))
+            if rows == 1 or self._bytes(rows, capacity, groups) <= _SCRATCH:
+                return _Pass(tiles, capacity, rows, groups)
+            rows //= 2
 
-    def _shape(self, capacity: int, rows: int, replay: bool) -> np.ndarray:
-        s = self.settings
-        values = [self.texels, self.channels, s.width, s.height, self.across, s.queue, capacity, rows, int(replay)]
-        return np.array(values, np.int64)
-
-    def _traverse(
-        self, tiles: np.ndarray, image: np.ndarray, opacity: np.ndarray, grads: np.ndarray, notes: np.ndarray,
-        base: int, *, replay: bool,
-    ) -> int:  # fmt: skip
-        """Works through tiles, those whose queues were too short a second time; returns the hits noted."""
-        queue = self.settings.queue
-        longest = int(self.lengths[tiles].max(initial=1))
-        capacity = min(longest, _QUEUE if queue < 0 else queue + 1)
-        samples = 0
-        while len(tiles):
-            rows = self._rows(capacity)
-            states = self._run(tiles, capacity, rows, image, opacity, grads, notes, base, replay)
-            broken = max((int(state[1]) for state in states), default=0)
-            if broken:
-                _complain(broken - 1)
-            samples += sum(int(state[2]) for state in states)
-            tiles = np.sort(np.concatenate([state[3 : 3 + state[0]] for state in states])).astype(np.int32)
-            capacity = int(self.lengths[tiles].max(initial=1))
-        return samples
-
-    def _rows(self, capacity: int) -> int:
-        row = binning.TILE_WIDTH * capacity * (4 * self.limits.itemsize + 4)
-        return int(np.clip(_SCRATCH // row, 1, binning.TILE_HEIGHT))
+    def _bytes(self, rows: int, capacity: int, groups: int) -> int:
+        reals, wholes, wides = cpu_pixels.scratch_sizes(rows, capacity, self.channels, groups, True)
+        return reals * self.limits.itemsize + wholes * 4 + wides * 8
 
     def _run(
-        self, tiles: np.ndarray, capacity: int, rows: int, image: np.ndarray, opacity: np.ndarray, grads: np.ndarray,
-        notes: np.ndarray, base: int, replay: bool,
+        self, plan: _Pass, replay: bool, image: np.ndarray, opacity: np.ndarray, grads: np.ndarray, covers: np.ndarray,
+        notes: np.ndarray, spots: np.ndarray, ranges: np.ndarray, base: int, made: np.ndarray | None = None,
     ) -> list[np.ndarray]:  # fmt: skip
-        b = self.bins
-        band = binning.TILE_WIDTH * rows
-        hits = 0
-        if replay:
-            hits = int(min(self.areas[tiles].max(initial=0), self.lengths[tiles].max(initial=0) * band))
-        reals = 5 * LANES + band * (1 + self.channels + 4 * capacity) + 3 * hits
-        wholes = 3 * band + band * capacity + 1 + 2 * hits
+        """Runs the blending kernel on all threads; returns each one's status."""
+        s, b = self.settings, self.bins
         workers = torch.get_num_threads()
-        require_memory(workers * (reals * self.limits.itemsize + wholes * 4), f"queues of {capacity} hits a pixel")
-        shape = self._shape(capacity, rows, replay)
+        require_memory(
+            workers * self._bytes(plan.rows, plan.capacity, plan.groups), f"queues of {plan.capacity} hits a pixel"
+        )
+        reals, wholes, wides = cpu_pixels.scratch_sizes(plan.rows, plan.capacity, self.channels, plan.groups, replay)
+        values = [self.texels, self.channels, s.width, s.height, self.across, s.queue, plan.capacity, plan.rows,
+                  plan.groups, int(replay)]  # fmt: skip
+        shape = np.array(values, np.int64)
         turn = np.zeros(1, np.int64)
 
         def work(_: int) -> np.ndarray:
-            state = np.zeros(3 + len(tiles), np.int64)
-            cpu_kernels.traverse(
-                turn, tiles, b.start, b.members, b.offset, b.record.reshape(-1), b.box, b.place, self.features,
-                self.alpha, self.limits, shape, image, opacity, grads, notes, base,
-                torch.empty(reals, dtype=self.dtype).numpy(), torch.empty(wholes, dtype=torch.int32).numpy(), state,
+            status = np.zeros(3 + len(plan.tiles), np.int64)
+            cpu_blend.blend_tiles(
+                turn, plan.tiles, b.start, b.members, b.record.reshape(-1), b.box, b.place, self.features,
+                self.alpha, self.limits, shape, image, opacity, grads, covers, notes, spots, ranges,
+                self.made if made is None else made, base, torch.empty(reals, dtype=self.dtype).numpy(),
+                torch.empty(wholes, dtype=torch.int32).numpy(), torch.empty(wides, dtype=torch.int64).numpy(), status,
             )  # fmt: skip
-            return state
+            return status
 
         return run_workers(work)
+
+
+def _divide(first_group: np.ndarray) -> list[tuple[int, int]]:
+    """Consecutive tiles whose hits can be noted together."""
+    parts, first = [], 0
+    for tile in range(1, len(first_group)):
+        if tile > first and first_group[tile] - first_group[first] > _NOTES and tile - first > 1:
+            parts.append((first, tile - 1))
+            first = tile - 1
+    parts.append((first, len(first_group) - 1))
+    return parts
 
 
 def _complain(billboard: int) -> None:
@@ -237,15 +266,16 @@ def _prepare(dtype: torch.dtype) -> None:
                 array(f64, 3), array(i32, 2), array(i32), f64, i64, array(i64), array(i32), array(i64), array(i64),
                 array(i32), array(i64),
             ),
-            cpu_kernels.traverse: (
-                array(i64), array(i32), array(i64), array(i32), array(i64), array(real), array(i32, 2), array(i32),
-                array(real), array(real), array(real), array(i64), array(real, 3), array(real, 2), array(real),
-                array(real), i64, array(real), array(i32), array(i64),
+            cpu_blend.blend_tiles: (
+                array(i64), array(i32), array(i64), array(i32), array(real), array(i32, 2), array(i32), array(real),
+                array(real), array(real), array(i64), *[array(real)] * 5, *[array(i32)] * 2, array(i64), i64,
+                array(real), array(i32), array(i64), array(i64),
             ),
-            cpu_kernels.collect: (
-                array(i64), i64, i64, i64, array(i32), array(i64), array(i32), array(i64), array(i64), array(i64),
-                array(real), array(i32, 2), array(real), array(real), array(real), array(i64), array(real),
-                array(real), i64, types.boolean, array(real), array(real), array(f64, 3), array(f64),
+            cpu_gather.gather_gradients: (
+                array(i64), i64, i64, i64, i64, array(i32), array(i64), array(i32), array(i64), array(i32), array(i64),
+                array(real), array(i32), i64, array(real), array(i32, 2), array(real), array(real), array(real),
+                array(i64), array(real), types.boolean, array(real), array(real), array(f64, 3), array(f64),
+                array(real),
             ),
         },
     )  # fmt: skip

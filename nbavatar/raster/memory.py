@@ -12,7 +12,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-__all__ = ["fetch_add", "get", "move4", "pointer", "put"]
+__all__ = ["ahead", "fetch_add", "get", "pointer", "prefetch", "put"]
 
 
 @intrinsic
@@ -48,17 +48,13 @@ def put(typingctx: Any, base: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
-def move4(typingctx: Any, base: Any, to: Any, source: Any) -> Any:
-    """Copies four neighbouring elements."""
+def ahead(typingctx: Any, base: Any, count: Any) -> Any:
+    """The pointer `count` elements on.
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        size = 4 if base.dtype == types.float32 else 8
-        kind = ir.VectorType(context.get_value_type(base.dtype), 4).as_pointer()
-        value = builder.load(builder.bitcast(builder.gep(args[0], [args[2]]), kind), align=size)
-        builder.store(value, builder.bitcast(builder.gep(args[0], [args[1]]), kind), align=size)
-        return context.get_dummy_value()
-
-    return types.none(base, types.intp, types.intp), generate
+    Where several addresses share a part, making it a pointer of its own keeps LLVM from working out the
+    products in it once for each of them.
+    """
+    return base(base, types.intp), lambda context, builder, signature, args: builder.gep(args[0], [args[1]])
 
 
 @intrinsic
@@ -70,3 +66,17 @@ def fetch_add(typingctx: Any, array: Any, amount: Any) -> Any:
         return builder.atomic_rmw("add", cgutils.gep(builder, view.data, 0), args[1], "monotonic")
 
     return types.int64(array, types.int64), generate
+
+
+@intrinsic
+def prefetch(typingctx: Any, base: Any, index: Any) -> Any:
+    """Asks for element `index` after a pointer to be brought near; an address that is none does no harm."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place = builder.bitcast(builder.gep(args[0], [args[1]]), ir.IntType(8).as_pointer())
+        hints = [ir.Constant(ir.IntType(32), hint) for hint in (0, 3, 1)]  # to read, often, data
+        kind = ir.FunctionType(ir.VoidType(), [place.type, *(hint.type for hint in hints)])
+        builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0"), [place, *hints])
+        return context.get_dummy_value()
+
+    return types.none(base, types.intp), generate

@@ -2,8 +2,8 @@
 
 Each is a few lines on numbers of one floating-point type, without branches and without access
 to memory. They are written against four operations that the target supplies, so the same
-source is compiled for one number at a time (Numba), for a row of pixels at a time (vector
-instructions, `vector.py`) and for a GPU thread. Numba would widen `float32 * literal` to
+source is compiled for eight pixels at a time (vector
+instructions, `lanes.py`) and for a GPU thread. Numba would widen `float32 * literal` to
 float64; every constant is therefore passed in as `zero` or `one`.
 """
 

@@ -1,0 +1,131 @@
+"""Queues of hits, one a pixel, sorted by depth: the nearest in slot 0.
+
+They are stored slot by slot: slot j of all pixels, then slot j + 1. A new row of hits passes the slots from
+the nearest on and in each the nearer of two stays, so no branch depends on a single pixel.
+"""
+
+import numpy as np
+
+from nbavatar.raster.binning import TILE_WIDTH
+from nbavatar.raster.compile import inlined
+from nbavatar.raster.cpu_pixels import SHIFT, blend, close
+from nbavatar.raster.lanes import LANES, any_lane, bits, choose, first_lanes, gather, load, maximum, spread, store
+
+__all__ = ["drain", "enqueue", "pop"]
+
+
+@inlined
+def enqueue(scene, k, hit, key, opacity, ids, first, level):
+    """Puts hits into the queues of the pixels `first + lane`; returns how many slots are in use then.
+
+    Of equal keys the one of lower place goes first.
+    """
+    none, shift = scene.limits.none, spread(np.int32(SHIFT))
+    key = choose(hit, key, none)
+    slot = 0
+    while True:
+        at = slot * scene.plane + first
+        held, held_opacity, held_id = load(k.keys, at), load(k.dims, at), load(k.ids, at)
+        ahead = key > held
+        tie = (key == held) & (key > none)
+        if any_lane(tie):
+            ahead = ahead | (tie & (gather(k.place, ids >> shift) < gather(k.place, held_id >> shift)))
+        store(k.keys, at, choose(ahead, key, held))
+        store(k.dims, at, choose(ahead, opacity, held_opacity))
+        store(k.ids, at, choose(ahead, ids, held_id))
+        key, opacity, ids = (
+            choose(ahead, held, key), choose(ahead, held_opacity, opacity), choose(ahead, held_id, ids),
+        )  # fmt: skip
+        slot += 1
+        if not any_lane(key > none):
+            return max(level, slot)
+
+
+@inlined
+def _shift(scene, k, first, slot, source, level, moved, done):
+    """Moves slot `source` of the pixels in the mask `moved` to `slot`; empties it for those that are done."""
+    none = scene.limits.none
+    to, at = slot * scene.plane + first, source * scene.plane + first
+    if source < level:
+        key = choose(done, none, choose(moved, load(k.keys, at), load(k.keys, to)))
+        store(k.dims, to, choose(moved, load(k.dims, at), load(k.dims, to)))
+        store(k.ids, to, choose(moved, load(k.ids, at), load(k.ids, to)))
+    else:
+        key = choose(done | moved, none, load(k.keys, to))
+    store(k.keys, to, key)
+    return key
+
+
+@inlined
+def pop(scene, k, first, pixel, full, level, noted):
+    """Blends the nearest hit of the queues in the mask `full`; returns the number of pixels that this has finished."""
+    one = scene.limits.one
+    through, opacity = load(k.through, first), load(k.dims, first)
+    blend(scene, k, bits(full), first, pixel, through, through * opacity, load(k.ids, first), noted)
+    through = choose(full, through * (one - opacity), through)
+    store(k.through, first, through)
+    done, finished = close(scene, k, first, through)
+    for slot in range(level):
+        _shift(scene, k, first, slot, slot + 1, level, full, done)
+    return finished
+
+
+@inlined
+def drain(scene, k, reach, level, left, top, pixels, width, noted):
+    """Blends all hits at least as near as `reach`; returns slots in use and pixels that this has finished.
+
+    A blended hit stays in its slot, with the key infinity, until the slot can go for all lanes. What waits
+    tells from which key on hits can be ignored: where so little light comes through it that they would not
+    be blended.
+
+    Args:
+        reach: key that no hit still to come exceeds.
+        level: slots in use before.
+        left, top: first column and row of the band; pixels: in it.
+    """
+    one, none, t_min, infinite = (
+        scene.limits.one, scene.limits.none, scene.limits.t_min,
+        scene.limits.infinite,
+    )  # fmt: skip
+    near = spread(reach)
+    in_use, finished = 0, 0
+    for first in range(0, pixels, LANES):
+        key, through = load(k.keys, first), load(k.through, first)
+        slot, gone = 0, 0
+        while any_lane(key >= near):
+            at = slot * scene.plane + first
+            now = (key >= near) & (key < infinite) & (through >= t_min)
+            word = bits(now)
+            if word != 0:
+                pixel = (top + first // TILE_WIDTH) * width + left + first % TILE_WIDTH
+                opacity = load(k.dims, at)
+                blend(scene, k, word, first, pixel, through, through * opacity, load(k.ids, at), noted)
+                through = choose(now, through * (one - opacity), through)
+            store(k.keys, at, choose(key >= near, infinite, key))
+            slot += 1
+            if gone == slot - 1 and not any_lane((key > none) & (key < near)):
+                gone = slot
+            if slot == level:
+                break
+            key = load(k.keys, at + scene.plane)
+        store(k.through, first, through)
+        done, count = close(scene, k, first, through)
+        finished += count
+        floor = load(k.floor, first)
+        every = first_lanes(LANES)
+        slots = 0
+        for slot in range(level):
+            key = load(k.keys, slot * scene.plane + first)
+            if gone > 0 or count > 0:
+                key = _shift(scene, k, first, slot, slot + gone, level, every, done)
+            if not any_lane(key > none):
+                if gone == 0 and count == 0:
+                    break
+                continue
+            slots = slot + 1
+            waits = (key > none) & (key < infinite)
+            through = choose(waits, through * (one - load(k.dims, slot * scene.plane + first)), through)
+            floor = choose(waits & (through < t_min), maximum(floor, key), floor)
+        store(k.floor, first, floor)
+        in_use = max(in_use, slots)
+    return in_use, finished
