@@ -38,6 +38,8 @@ VERBS = {
     "reenact": "drive one subject by another's poses",
     "video": "a turntable or a driven sequence as mp4",
     "report": "one self-contained HTML page with tables and pictures",
+    "tradeoff": "speed against quality of an avatar, setting by setting; presets",
+    "extremes": "every numerical kernel at its limits, against an oracle: exact, degrades or refuses",
     "bench": "benchmarks of single kernels: raster, deform, spectral, fit",
     "warm": "run a command, such as snakemake, in which the verbs that need torch start at once",
     "doctor": "what this machine can do, and what is missing for which stage",
