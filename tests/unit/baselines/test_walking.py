@@ -94,7 +94,7 @@ def test_over_folds_a_walk_is_straight_in_the_unfolded_strip(seed: int) -> None:
 def cone(angles: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Triangles around an apex (vertex 0) with given angles at it, long legs, closed up in space by any means.
 
-    Only the lengths of the edges matter to a walk, so the cone is built from a circle whose vertices lie at the distance
+    Only the lengths of the edges matter to a walk, so the cone stands on a circle whose vertices lie at the distance
     1 from the apex and at the chords of the angles from each other; angles sum to less than 2 pi.
     """
     chords = 2 * np.sin(angles / 2)
