@@ -40,6 +40,7 @@ def front_figure(points: Sequence[Point], presets: Mapping[str, Point], cost: st
         caption: device, picture size, number of images.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     # Places by hand: matplotlib's own layout measures every label several times, which takes seconds.
     figure = Figure(figsize=(11.0, 5.0), dpi=120)
@@ -65,6 +66,9 @@ def front_figure(points: Sequence[Point], presets: Mapping[str, Point], cost: st
         _label_front(axis, [points[i] for i in front], [(costs[i], gains[i]) for i in front])
         if max(costs) > 3 * min(costs):
             axis.set_xscale("log")
+            axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.xaxis.set_minor_formatter(NullFormatter())
         if sign < 0:
             axis.invert_yaxis()
         axis.set_xlabel(COSTS[cost])
