@@ -140,9 +140,7 @@ def cell(
 
     def register(measure: Callable[..., Sample | Refusal]) -> Callable[..., Sample | Refusal]:
         chosen = quick if quick is not None else tuple(dict.fromkeys((levels[0], levels[-1])))
-        made = Cell(
-            family, kernel, condition, axis, levels, chosen, oracle, measure, exact, unit, limits, refuses
-        )  # fmt: skip
+        made = Cell(family, kernel, condition, axis, levels, chosen, oracle, measure, exact, unit, limits, refuses)
         if made.name in _CELLS or family not in FAMILIES:
             raise ValueError(f"cell {made.name}: registered twice, or of an unknown family")
         _CELLS[made.name] = made

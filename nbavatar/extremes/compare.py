@@ -50,7 +50,7 @@ def precise(values: object) -> np.ndarray:
     from mpmath import mpf
 
     array = np.asarray(values, np.float64)
-    result = np.empty(array.shape, object)
+    result = np.full(array.shape, None, object)
     for index in np.ndindex(array.shape):
         result[index] = mpf(float(array[index]))
     return result

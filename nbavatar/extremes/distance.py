@@ -1,5 +1,7 @@
 """Cells of the distance queries of deforming meshes, float64, against every triangle in 40 digits."""
 
+from typing import Any
+
 import numpy as np
 
 from nbavatar.extremes.cells import DOUBLE, Level, Limit, Sample, Tolerance, cell
@@ -60,10 +62,10 @@ def _queries(count: int = 12, size: float = 1.0) -> np.ndarray:
     return np.random.default_rng(2).normal(size=(count, 3)) * 0.6 * size
 
 
-def _cell(kernel: str, condition: str, axis: str, levels: tuple[Level, ...], **more: object):
+def _cell(kernel: str, condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
     more.setdefault("oracle", _ORACLE)
     more.setdefault("exact", DOUBLE)
-    return cell("distance", kernel, condition, axis, levels, unit="of the mesh", **more)  # type: ignore[arg-type]
+    return cell("distance", kernel, condition, axis, levels, unit="of the mesh", **more)
 
 
 @_cell("closest", "size of the mesh", "width [m]", (1.0, 1e-6, 1e-30, 1e6, 1e30))
@@ -91,9 +93,14 @@ def _far(distance: float) -> Sample:
 
 
 @_cell(
-    "closest", "slivers", "height / edge [1]", (1.0, 1e-2, 1e-4, 1e-8, 1e-12, 0.0),
-    limits=(Limit(lambda height: 0 < float(height) <= 1e-8, 1e-6, 1.0, "inner point of a needle from cancelling areas"),),
-)  # fmt: skip
+    "closest",
+    "slivers",
+    "height / edge [1]",
+    (1.0, 1e-2, 1e-4, 1e-8, 1e-12, 0.0),
+    limits=(
+        Limit(lambda height: 0 < float(height) <= 1e-8, 1e-6, 1.0, "inner point of a needle from cancelling areas"),
+    ),
+)
 def _slivers(height: float) -> Sample:
     verts = np.array([[0.0, 0, 0], [1, 0, 0], [0.4, height, 0], [0.45, -height, 1e-3]])
     points = np.concatenate(
@@ -121,18 +128,26 @@ _INSIDE = "sides of the planes of a tetrahedron"
 
 
 @_cell(
-    "inside", "distance to the surface", "distance / width [1]", (0.1, 1e-3, 1e-6, 1e-9, 1e-12, 1e-15), oracle=_INSIDE,
+    "inside",
+    "distance to the surface",
+    "distance / width [1]",
+    (0.1, 1e-3, 1e-6, 1e-9, 1e-12, 1e-15),
+    oracle=_INSIDE,
     exact=Tolerance(0.0, 0.0),
     limits=(Limit(lambda gap: float(gap) <= 1e-15, 1.0, 1.0, "within rounding of the surface"),),
-)  # fmt: skip
+)
 def _inside(gap: float) -> Sample:
     return _sides(gap, 0.0, 1.0)
 
 
 @_cell(
-    "inside", "mesh far from the origin", "offset / width [1]", (0.0, 1e2, 1e4, 1e6), oracle=_INSIDE,
+    "inside",
+    "mesh far from the origin",
+    "offset / width [1]",
+    (0.0, 1e2, 1e4, 1e6),
+    oracle=_INSIDE,
     exact=Tolerance(0.0, 0.0),
-)  # fmt: skip
+)
 def _inside_offset(offset: float) -> Sample:
     return _sides(1e-6, offset, 1.0)
 
@@ -160,10 +175,18 @@ def _sides(gap: float, offset: float, size: float) -> Sample:
     return Sample(float(max((mesh.inside(points) != truth).mean(), (by_sign != truth).mean())))
 
 
-@_cell("inside", "winding number of an open mesh", "height over the hole / width [1]", (0.5, 1e-3, 1e-9, 0.0),
-       oracle="solid angles of the closed fan, 40 digits", exact=Tolerance(1e-9, 1.0),
-       limits=(Limit(lambda gap: gap == 0.0, 1.5, 1.0, "on the lid that closes the hole there is no side"),
-               Limit(lambda gap: float(gap) <= 1e-9, 1e-7, 1.0, "solid angles close to a half turn")))  # fmt: skip
+@_cell(
+    "inside",
+    "winding number of an open mesh",
+    "height over the hole / width [1]",
+    (0.5, 1e-3, 1e-9, 0.0),
+    oracle="solid angles of the closed fan, 40 digits",
+    exact=Tolerance(1e-9, 1.0),
+    limits=(
+        Limit(lambda gap: gap == 0.0, 1.5, 1.0, "on the lid that closes the hole there is no side"),
+        Limit(lambda gap: float(gap) <= 1e-9, 1e-7, 1.0, "solid angles close to a half turn"),
+    ),
+)
 def _winding(gap: float) -> Sample:
     """A tetrahedron without its last face; points just under the missing face have winding number 1."""
     verts, faces = _tetrahedron()

@@ -38,9 +38,14 @@ def _ring(radius: float) -> np.ndarray:
 
 
 @cell(
-    "distortion", "distort_plane", "distance from the axis", "radius, plane z = 1 [1]", (0.1, 0.0, 0.5, 1.0, 10.0, 1e4, 1e8),
-    oracle=_ORACLE, exact=DOUBLE,
-)  # fmt: skip
+    "distortion",
+    "distort_plane",
+    "distance from the axis",
+    "radius, plane z = 1 [1]",
+    (0.1, 0.0, 0.5, 1.0, 10.0, 1e4, 1e8),
+    oracle=_ORACLE,
+    exact=DOUBLE,
+)
 def _forward(radius: float) -> Sample:
     import mpmath
 
@@ -49,10 +54,16 @@ def _forward(radius: float) -> Sample:
 
 
 @cell(
-    "distortion", "distort_plane", "towards a pole of the rational model", "1 + k4 r2 [1]",
-    (0.5, 1e-2, 1e-6, 1e-12, 0.0), oracle=_ORACLE, exact=DOUBLE, refuses=lambda gap: gap == 0.0,
+    "distortion",
+    "distort_plane",
+    "towards a pole of the rational model",
+    "1 + k4 r2 [1]",
+    (0.5, 1e-2, 1e-6, 1e-12, 0.0),
+    oracle=_ORACLE,
+    exact=DOUBLE,
+    refuses=lambda gap: gap == 0.0,
     limits=(Limit(lambda gap: 0 < float(gap) <= 1e-6, 1e-2, 1.0, "the denominator loses its digits"),),
-)  # fmt: skip
+)
 def _pole(gap: float) -> Sample | Refusal:
     import mpmath
 
@@ -66,11 +77,17 @@ def _pole(gap: float) -> Sample | Refusal:
 
 
 @cell(
-    "distortion", "undistort_pixels", "towards the fold of a barrel lens", "radius / radius of the fold [1]",
-    (0.1, 0.5, 0.9, 0.99, 0.999, 0.99999, 1.001, 2.0, 100.0), quick=(0.1, 0.99, 1.001),
-    oracle="the ideal points themselves", exact=Tolerance(1e-8, 1.0), refuses=lambda radius: float(radius) >= 0.999,
+    "distortion",
+    "undistort_pixels",
+    "towards the fold of a barrel lens",
+    "radius / radius of the fold [1]",
+    (0.1, 0.5, 0.9, 0.99, 0.999, 0.99999, 1.001, 2.0, 100.0),
+    quick=(0.1, 0.99, 1.001),
+    oracle="the ideal points themselves",
+    exact=Tolerance(1e-8, 1.0),
+    refuses=lambda radius: float(radius) >= 0.999,
     limits=(Limit(lambda radius: float(radius) >= 0.99, 1e-4, 1.0, "the slope of the lens goes to zero"),),
-)  # fmt: skip
+)
 def _fold(share: float) -> Sample | Refusal:
     coefficients = np.array([-0.3, 0, 0, 0])
     fold = np.sqrt(1 / 0.9)  # of r - 0.3 r^3
@@ -85,9 +102,15 @@ def _fold(share: float) -> Sample | Refusal:
 
 
 @cell(
-    "distortion", "undistort_pixels", "strength of the lens", "k1 [1]", (0.0, -0.1, -0.5, -1.0, 0.5, 5.0, 100.0),
-    oracle="the ideal points themselves", exact=Tolerance(1e-8, 1.0), refuses=lambda k: k == -1.0,
-)  # fmt: skip
+    "distortion",
+    "undistort_pixels",
+    "strength of the lens",
+    "k1 [1]",
+    (0.0, -0.1, -0.5, -1.0, 0.5, 5.0, 100.0),
+    oracle="the ideal points themselves",
+    exact=Tolerance(1e-8, 1.0),
+    refuses=lambda k: k == -1.0,
+)
 def _strong(k1: float) -> Sample | Refusal:
     coefficients = np.array([k1, 0, 0, 0])
     ideal = np.concatenate([_ring(radius) for radius in (0.0, 0.05, 0.2, 0.5)])
@@ -99,9 +122,14 @@ def _strong(k1: float) -> Sample | Refusal:
 
 
 @cell(
-    "distortion", "undistort_pixels", "missing detections", "case", ("none", "one NaN", "all NaN", "infinite", "empty"),
-    oracle="the ideal points themselves", exact=Tolerance(1e-8, 1.0),
-)  # fmt: skip
+    "distortion",
+    "undistort_pixels",
+    "missing detections",
+    "case",
+    ("none", "one NaN", "all NaN", "infinite", "empty"),
+    oracle="the ideal points themselves",
+    exact=Tolerance(1e-8, 1.0),
+)
 def _missing(case: str) -> Sample:
     ideal = _ring(0.3)
     seen = distort_plane(ideal, _BARREL) * 1000 + 512
@@ -117,10 +145,16 @@ def _missing(case: str) -> Sample:
 
 
 @cell(
-    "distortion", "undistortion_map", "offset of the crop", "offset [px]", (0.0, 1e3, 1e4, 1e5, 1e7),
-    oracle=_ORACLE, unit="px", exact=Tolerance(1e-2, 1.0),
+    "distortion",
+    "undistortion_map",
+    "offset of the crop",
+    "offset [px]",
+    (0.0, 1e3, 1e4, 1e5, 1e7),
+    oracle=_ORACLE,
+    unit="px",
+    exact=Tolerance(1e-2, 1.0),
     limits=(Limit(lambda offset: float(offset) >= 1e5, 1.0, 1.0, "maps are float32, 1e-7 of the coordinate"),),
-)  # fmt: skip
+)
 def _map(offset: float) -> Sample:
     import mpmath
 
@@ -140,9 +174,14 @@ def _plane_exact(xy: np.ndarray) -> np.ndarray:
 
 
 @cell(
-    "distortion", "distort_vertices", "vertices outside the lens's reach", "radius, plane z = 1 [1]",
-    (0.1, 0.5, 1.0, 10.0, 1e6), oracle="the lens within reach, its displacement in proportion beyond", exact=DOUBLE,
-)  # fmt: skip
+    "distortion",
+    "distort_vertices",
+    "vertices outside the lens's reach",
+    "radius, plane z = 1 [1]",
+    (0.1, 0.5, 1.0, 10.0, 1e6),
+    oracle="the lens within reach, its displacement in proportion beyond",
+    exact=DOUBLE,
+)
 def _vertices(radius: float) -> Sample:
     reach = 0.6
     points = np.concatenate((_ring(radius), np.ones((12, 1))), 1) * 2.0
@@ -153,17 +192,31 @@ def _vertices(radius: float) -> Sample:
 
     with mpmath.workdps(50):
         true = _plane(_ring(radius * inner), _BARREL) / inner * 2.0
-    return Sample(max(relative(found[:12, :2], true), relative(found[:, 2], [2.0] * 12 + [-1.0, 0.0]),
-                      relative(found[12:], behind)))  # fmt: skip
+    return Sample(
+        max(
+            relative(found[:12, :2], true),
+            relative(found[:, 2], [2.0] * 12 + [-1.0, 0.0]),
+            relative(found[12:], behind),
+        )
+    )
 
 
 @cell(
-    "distortion", "checked_coefficients", "not a lens", "case", ("3 numbers", "NaN", "text", "tilted sensor"),
-    quick=("3 numbers",), oracle="a one-line refusal", refuses=lambda case: True,
-)  # fmt: skip
+    "distortion",
+    "checked_coefficients",
+    "not a lens",
+    "case",
+    ("3 numbers", "NaN", "text", "tilted sensor"),
+    quick=("3 numbers",),
+    oracle="a one-line refusal",
+    refuses=lambda case: True,
+)
 def _refused(case: Level) -> Sample:
     values: dict[Level, object] = {
-        "3 numbers": [1.0, 2, 3], "NaN": [np.nan] * 5, "text": "wide", "tilted sensor": [0.1] * 14,
-    }  # fmt: skip
+        "3 numbers": [1.0, 2, 3],
+        "NaN": [np.nan] * 5,
+        "text": "wide",
+        "tilted sensor": [0.1] * 14,
+    }
     checked_coefficients(values[case], "camera 1: distortion")
     return Sample(float("nan"))

@@ -4,6 +4,8 @@ Oracle of sound faces is the textbook frame in float64, written anew; of degener
 definition of this project, the same function in float64, and that the rotation is orthonormal.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -71,19 +73,26 @@ def _measure(
     chosen = slice(None) if only is None else slice(only, only + 1)
     gap, span = (T.double() - T0)[chosen], size * max(1, len(T0[chosen])) ** 0.5
     forward = max(
-        float(gap.norm()) / span, relative(R[chosen], R0[chosen]), relative(k[chosen], k0[chosen], least=1e-3 * span),
+        float(gap.norm()) / span,
+        relative(R[chosen], R0[chosen]),
+        relative(k[chosen], k0[chosen], least=1e-3 * span),
         float(upright.abs().max() if len(R) else 0.0),
-    )  # fmt: skip
+    )
     finite = all(bool(torch.isfinite(value).all()) for value in (T, R, k, *found))
     return Sample(forward if finite else float("nan"), gradient_error(found, true))
 
 
-def _cell(condition: str, axis: str, levels: tuple[Level, ...], oracle: str, **more: object):
-    return cell("frames", "face_frames float32", condition, axis, levels, oracle=oracle, **more)  # type: ignore[arg-type]
+def _cell(condition: str, axis: str, levels: tuple[Level, ...], oracle: str, **more: Any):
+    return cell("frames", "face_frames float32", condition, axis, levels, oracle=oracle, **more)
 
 
-@_cell("size of the mesh", "width [m]", (1.0, 1e-3, 1e-6, 1e-12, 1e-17, 1e3, 1e6, 1e12), _TEXTBOOK,
-       quick=(1.0, 1e-12, 1e12))  # fmt: skip
+@_cell(
+    "size of the mesh",
+    "width [m]",
+    (1.0, 1e-3, 1e-6, 1e-12, 1e-17, 1e3, 1e6, 1e12),
+    _TEXTBOOK,
+    quick=(1.0, 1e-12, 1e12),
+)
 def _size(size: float) -> Sample:
     verts, faces = patch()
     return _measure(verts * size, faces, textbook=True, size=size)
@@ -102,19 +111,27 @@ def _offset(offset: float) -> Sample:
 
 
 @_cell(
-    "sliver", "height / edge of one face [1]", (1.0, 1e-1, 1e-2, 2e-3), _TEXTBOOK,
-    limits=(Limit(lambda ratio: float(ratio) <= 1e-2, 1e-4, 1e-3, "the normal of a thin face from 24-bit coordinates"),),
-)  # fmt: skip
+    "sliver",
+    "height / edge of one face [1]",
+    (1.0, 1e-1, 1e-2, 2e-3),
+    _TEXTBOOK,
+    limits=(
+        Limit(lambda ratio: float(ratio) <= 1e-2, 1e-4, 1e-3, "the normal of a thin face from 24-bit coordinates"),
+    ),
+)
 def _sliver(ratio: float) -> Sample:
     verts, faces = _with_sliver(ratio)
     return _measure(verts, faces, textbook=True, only=len(faces) - 1)
 
 
 @_cell(
-    "sliver under the threshold", "height / edge of one face [1]", (9e-4, 5e-4, 2e-4, 1e-4, 1e-6, 1e-12, 0.0),
-    _DEFINITION, quick=(5e-4, 0.0),
+    "sliver under the threshold",
+    "height / edge of one face [1]",
+    (9e-4, 5e-4, 2e-4, 1e-4, 1e-6, 1e-12, 0.0),
+    _DEFINITION,
+    quick=(5e-4, 0.0),
     limits=(Limit(lambda ratio: float(ratio) <= 9e-4, 2e-3, 1e-2, "frame between the face's own and its neighbours'"),),
-)  # fmt: skip
+)
 def _flat(ratio: float) -> Sample:
     verts, faces = _with_sliver(ratio)
     return _measure(verts, faces, textbook=False)
@@ -129,13 +146,24 @@ def _with_sliver(ratio: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @_cell(
-    "degenerate mesh", "case",
-    ("repeated vertex", "first edge of no length", "three corners in one point", "isolated sliver", "isolated point",
-     "whole mesh in one point", "faces folded onto each other", "one face", "no face", "normal along -z"),
+    "degenerate mesh",
+    "case",
+    (
+        "repeated vertex",
+        "first edge of no length",
+        "three corners in one point",
+        "isolated sliver",
+        "isolated point",
+        "whole mesh in one point",
+        "faces folded onto each other",
+        "one face",
+        "no face",
+        "normal along -z",
+    ),
     _DEFINITION,
     quick=("repeated vertex", "whole mesh in one point"),
     limits=(Limit(lambda case: True, 1e-3, 1e-3, "frame of the neighbours"),),
-)  # fmt: skip
+)
 def _degenerate(case: str) -> Sample:
     verts, faces = patch()
     if case == "repeated vertex":
@@ -163,10 +191,14 @@ def _degenerate(case: str) -> Sample:
 
 
 @cell(
-    "frames", "initial_half_extents", "sliver", "height / edge of one face [1]", (1.0, 1e-2, 1e-4, 1e-12, 0.0),
+    "frames",
+    "initial_half_extents",
+    "sliver",
+    "height / edge of one face [1]",
+    (1.0, 1e-2, 1e-4, 1e-12, 0.0),
     oracle=_DEFINITION,
     limits=(Limit(lambda ratio: float(ratio) <= 1e-2, 1e-3, 1e-3, "the face's frame has few digits"),),
-)  # fmt: skip
+)
 def _extents(ratio: float) -> Sample:
     verts, faces = _with_sliver(ratio)
     results = []

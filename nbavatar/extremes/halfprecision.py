@@ -1,6 +1,7 @@
 """Cells of the renderer in half precision, against float64: activations beyond 65504, tiny ones, black."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,9 +22,17 @@ _QUICK = (1.0, 0.0, 1e7)
 def _avatar(channels: int = 6) -> Avatar:
     torch.manual_seed(0)
     architecture = Architecture(
-        channels=channels, texels=2, deferred=True, unet_width=8, unet_depth=3, unet_max_width=32, unet_convs=1,
-        roi=False, roi_margin=0.0, order="ray",
-    )  # fmt: skip
+        channels=channels,
+        texels=2,
+        deferred=True,
+        unet_width=8,
+        unet_depth=3,
+        unet_max_width=32,
+        unet_convs=1,
+        roi=False,
+        roi_margin=0.0,
+        order="ray",
+    )
     billboards = Billboards(torch.ones(1, 2), torch.zeros(1, 2, 2, channels), torch.zeros(1, 2, 2))
     return Avatar(architecture, {"head": torch.tensor([[0, 1, 2]])}, {"head": 3}, billboards)
 
@@ -61,29 +70,32 @@ def _decode(scale: float, precision: str, *, constant: bool = False) -> Sample:
     return Sample(relative(outputs[0], outputs[1]), math.nan if any(map(math.isnan, errors)) else max(errors))
 
 
-def _cell(precision: str, condition: str, **more: object):
+def _cell(precision: str, condition: str, **more: Any):
     axis = "largest feature [1]"
-    return cell("halfprecision", f"decode {precision}", condition, axis, _SCALES, quick=_QUICK, oracle=_ORACLE, **more)  # type: ignore[arg-type]
+    return cell("halfprecision", f"decode {precision}", condition, axis, _SCALES, quick=_QUICK, oracle=_ORACLE, **more)
 
 
 _SATURATED = "activations of 1e5 and more: decided by the last digits"
 
 
-@_cell("fp32", "magnitude of the features",
-       limits=(Limit(lambda scale: float(scale) >= 1e5, 1e-4, 1e-2, _SATURATED),))  # fmt: skip
+@_cell("fp32", "magnitude of the features", limits=(Limit(lambda scale: float(scale) >= 1e5, 1e-4, 1e-2, _SATURATED),))
 def _single(scale: float) -> Sample:
     return _decode(scale, "fp32")
 
 
-@_cell("fp32", "constant image",
-       limits=(Limit(lambda scale: float(scale) >= 1e5, 1e-4, 1.5, _SATURATED),))  # fmt: skip
+@_cell("fp32", "constant image", limits=(Limit(lambda scale: float(scale) >= 1e5, 1e-4, 1.5, _SATURATED),))
 def _single_constant(scale: float) -> Sample:
     return _decode(scale, "fp32", constant=True)
 
 
-@_cell("bf16", "magnitude of the features",
-       limits=(Limit(lambda scale: float(scale) >= 1e3, 0.1, 2.0, _SATURATED),
-               Limit(lambda scale: True, 2e-2, 0.3, "bf16 has 8 bits")))  # fmt: skip
+@_cell(
+    "bf16",
+    "magnitude of the features",
+    limits=(
+        Limit(lambda scale: float(scale) >= 1e3, 0.1, 2.0, _SATURATED),
+        Limit(lambda scale: True, 2e-2, 0.3, "bf16 has 8 bits"),
+    ),
+)
 def _brain(scale: float) -> Sample:
     return _decode(scale, "bf16")
 

@@ -18,8 +18,16 @@ __all__: list[str] = []
 _EQUAL = Tolerance(0.0, 0.0)
 
 
-@cell("image", "union_box", "share of missing boxes", "missing [1]", (0.0, 0.5, 0.9, 1.0), oracle="box of the valid rows",
-      exact=_EQUAL, refuses=lambda share: share == 1.0)  # fmt: skip
+@cell(
+    "image",
+    "union_box",
+    "share of missing boxes",
+    "missing [1]",
+    (0.0, 0.5, 0.9, 1.0),
+    oracle="box of the valid rows",
+    exact=_EQUAL,
+    refuses=lambda share: share == 1.0,
+)
 def _union(share: float) -> Sample | Refusal:
     boxes = _boxes(share)
     found = union_box(boxes)
@@ -37,8 +45,16 @@ def _boxes(share: float) -> np.ndarray:
     return boxes
 
 
-@cell("image", "fill_missing", "share of missing boxes", "missing [1]", (0.0, 0.5, 0.9, 1.0),
-      oracle="the nearest valid row before the first", exact=_EQUAL, refuses=lambda share: share == 1.0)  # fmt: skip
+@cell(
+    "image",
+    "fill_missing",
+    "share of missing boxes",
+    "missing [1]",
+    (0.0, 0.5, 0.9, 1.0),
+    oracle="the nearest valid row before the first",
+    exact=_EQUAL,
+    refuses=lambda share: share == 1.0,
+)
 def _fill(share: float) -> Sample | Refusal:
     boxes = _boxes(share)
     found = fill_missing(boxes)
@@ -48,15 +64,24 @@ def _fill(share: float) -> Sample | Refusal:
     return Sample(relative(found, np.concatenate((np.tile(boxes[first], (first, 1)), boxes[first:]))))
 
 
-@cell("image", "square_window", "box", "case",
-      ("inside", "one point", "larger than the image", "outside the image", "1e6 px away", "inverted"),
-      oracle="square; inside the image, or holding all of it", exact=_EQUAL)  # fmt: skip
+@cell(
+    "image",
+    "square_window",
+    "box",
+    "case",
+    ("inside", "one point", "larger than the image", "outside the image", "1e6 px away", "inverted"),
+    oracle="square; inside the image, or holding all of it",
+    exact=_EQUAL,
+)
 def _window(case: Level) -> Sample:
     box = {
-        "inside": [20.0, 30, 60, 50], "one point": [20.0, 20, 20, 20], "larger than the image": [-50.0, -50, 900, 700],
-        "outside the image": [200.0, 200, 240, 240], "1e6 px away": [1e6, 1e6, 1e6 + 10, 1e6 + 10],
+        "inside": [20.0, 30, 60, 50],
+        "one point": [20.0, 20, 20, 20],
+        "larger than the image": [-50.0, -50, 900, 700],
+        "outside the image": [200.0, 200, 240, 240],
+        "1e6 px away": [1e6, 1e6, 1e6 + 10, 1e6 + 10],
         "inverted": [60.0, 50, 20, 30],
-    }[str(case)]  # fmt: skip
+    }[str(case)]
     width, height = 100, 80
     x0, y0, side = square_window(np.array(box), width, height, pad=0.1)
     good = side >= 2
@@ -65,9 +90,16 @@ def _window(case: Level) -> Sample:
     return Sample(0.0 if good else math.nan)
 
 
-@cell("image", "clean_labels", "labels", "case",
-      ("empty", "full", "one pixel", "checkerboard", "one-pixel image", "empty support"), quick=("empty", "full"),
-      oracle="no label that was not there; whole parts stay", exact=_EQUAL)  # fmt: skip
+@cell(
+    "image",
+    "clean_labels",
+    "labels",
+    "case",
+    ("empty", "full", "one pixel", "checkerboard", "one-pixel image", "empty support"),
+    quick=("empty", "full"),
+    oracle="no label that was not there; whole parts stay",
+    exact=_EQUAL,
+)
 def _clean(case: Level) -> Sample:
     label = np.zeros((24, 32), np.uint8)
     support = label.copy()
@@ -91,8 +123,15 @@ def _clean(case: Level) -> Sample:
     return Sample(0.0 if set(np.unique(found)) <= known and kept and filled and still else math.nan)
 
 
-@cell("image", "threshold_matte", "matte", "case", ("all 0", "all 255", "one white pixel", "constant at the threshold"),
-      oracle="count of foreground pixels", exact=_EQUAL)  # fmt: skip
+@cell(
+    "image",
+    "threshold_matte",
+    "matte",
+    "case",
+    ("all 0", "all 255", "one white pixel", "constant at the threshold"),
+    oracle="count of foreground pixels",
+    exact=_EQUAL,
+)
 def _matte(case: Level) -> Sample:
     matte = np.zeros((9, 9), np.uint8)
     if case == "all 255":
@@ -104,9 +143,17 @@ def _matte(case: Level) -> Sample:
     return Sample(abs(float(threshold_matte(matte, 128).sum()) - (81.0 if case == "all 255" else 0.0)))
 
 
-@cell("image", "estimate_foreground", "coverage", "coverage [1/255]", (128.0, 1.0, 254.0, 0.0, 255.0),
-      oracle="a constant foreground over a constant backdrop", exact=Tolerance(3.0, 1.0), unit="grey levels",
-      limits=(Limit(lambda coverage: coverage == 128.0, 20.0, 1.0, "fused from blurs: dark far from the full pixels"),))  # fmt: skip
+@cell(
+    "image",
+    "estimate_foreground",
+    "coverage",
+    "coverage [1/255]",
+    (128.0, 1.0, 254.0, 0.0, 255.0),
+    oracle="a constant foreground over a constant backdrop",
+    exact=Tolerance(3.0, 1.0),
+    unit="grey levels",
+    limits=(Limit(lambda coverage: coverage == 128.0, 20.0, 1.0, "fused from blurs: dark far from the full pixels"),),
+)
 def _foreground(coverage: float) -> Sample:
     """A white disc over black, its rim covered by this much; the rim must become white as far as it can be told."""
     y, x = np.mgrid[:40, :40] - 19.5
@@ -121,9 +168,15 @@ def _foreground(coverage: float) -> Sample:
     return Sample(float(np.abs(found[rim] - 255).mean()) if rim.any() else 0.0)
 
 
-@cell("image", "region_of", "billboards", "case",
-      ("in view", "none", "behind", "at the camera", "outside the image", "1e6 m away", "of 1e6 m"),
-      oracle="projected corners lie in the window", exact=_EQUAL)  # fmt: skip
+@cell(
+    "image",
+    "region_of",
+    "billboards",
+    "case",
+    ("in view", "none", "behind", "at the camera", "outside the image", "1e6 m away", "of 1e6 m"),
+    oracle="projected corners lie in the window",
+    exact=_EQUAL,
+)
 def _region(case: Level) -> Sample:
     means = torch.tensor([[0.0, 0.0, 2.0], [0.1, -0.1, 2.1]])
     extents = torch.full((2, 2), 0.05)

@@ -4,6 +4,8 @@ A function that is linear on a flat patch has the patch's area as its Dirichlet 
 an oracle without any discretisation error. The textbook operator is compared with cotangents in mpmath.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -48,18 +50,22 @@ def _energy(verts: np.ndarray, faces: np.ndarray, area: float) -> Sample:
     return Sample(max(relative(energies, [share, share, 0.0]), relative(mass.sum(), area), wrong))
 
 
-def _robust(condition: str, axis: str, levels: tuple[Level, ...], **more: object):
+def _robust(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
     more.setdefault("oracle", "energy of linear functions = area; symmetric, semi-definite, no negative weight")
     more.setdefault("exact", _EXACT)
-    return cell("laplacian", "robust_laplacian", condition, axis, levels, **more)  # type: ignore[arg-type]
+    return cell("laplacian", "robust_laplacian", condition, axis, levels, **more)
 
 
 # The mollification moves every edge by 1e-5 of the mean edge where a triangle is that thin.
 _THIN = "thin triangles are thickened by 1e-5 of the mean edge"
 
 
-@_robust("obtuse slivers within a sound rim", "height / width [1]", (1.0, 0.1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-12, 0.0),
-         limits=(Limit(lambda height: float(height) <= 1e-3, 1e-3, 1.0, _THIN),))  # fmt: skip
+@_robust(
+    "obtuse slivers within a sound rim",
+    "height / width [1]",
+    (1.0, 0.1, 1e-2, 1e-3, 1e-4, 1e-6, 1e-12, 0.0),
+    limits=(Limit(lambda height: float(height) <= 1e-3, 1e-3, 1.0, _THIN),),
+)
 def _slivers(height: float) -> Sample:
     """The inner vertices of a square, pressed towards a line."""
     verts, faces, area = _flat()
@@ -68,15 +74,23 @@ def _slivers(height: float) -> Sample:
     return _energy(verts, faces, area)
 
 
-@_robust("obtuse corners opposite the rim", "largest angle [deg]", (90.0, 100.0, 120.0, 150.0, 170.0),
-         limits=(Limit(lambda angle: float(angle) > 120, 1.0, 1.0, "beyond an obtuse rim lies the surface's own back"),))  # fmt: skip
+@_robust(
+    "obtuse corners opposite the rim",
+    "largest angle [deg]",
+    (90.0, 100.0, 120.0, 150.0, 170.0),
+    limits=(Limit(lambda angle: float(angle) > 120, 1.0, 1.0, "beyond an obtuse rim lies the surface's own back"),),
+)
 def _obtuse(angle: float) -> Sample:
     verts, faces, area = _flat(shear=-float(np.tan(np.radians(angle - 90.0))))
     return _energy(verts, faces, area)
 
 
-@_robust("one needle in a sound mesh", "height / edge [1]", (0.5, 1e-2, 1e-4, 1e-6, 1e-12, 0.0),
-         limits=(Limit(lambda height: float(height) <= 1e-4, 1e-3, 1.0, _THIN),))  # fmt: skip
+@_robust(
+    "one needle in a sound mesh",
+    "height / edge [1]",
+    (0.5, 1e-2, 1e-4, 1e-6, 1e-12, 0.0),
+    limits=(Limit(lambda height: float(height) <= 1e-4, 1e-3, 1.0, _THIN),),
+)
 def _needle(height: float) -> Sample:
     """An edge of the rim gets a vertex at a small distance outside."""
     verts, faces, area = _flat()
@@ -93,18 +107,34 @@ def _size(size: float) -> Sample:
 
 
 @_robust(
-    "mesh far from the origin", "offset / width [1]", (0.0, 1e2, 1e4, 1e6),
+    "mesh far from the origin",
+    "offset / width [1]",
+    (0.0, 1e2, 1e4, 1e6),
     limits=(Limit(lambda offset: float(offset) >= 1e6, 1e-8, 1.0, "the positions themselves are rounded"),),
-)  # fmt: skip
+)
 def _offset(offset: float) -> Sample:
     verts, faces, area = _flat()
     moved = verts + offset * np.array([1.0, -0.7, 0.4])
-    return Sample(max(_energy(verts, faces, area).forward,
-                      relative(robust_laplacian(moved, faces)[0].toarray(), robust_laplacian(verts, faces)[0].toarray())))  # fmt: skip
+    return Sample(
+        max(
+            _energy(verts, faces, area).forward,
+            relative(robust_laplacian(moved, faces)[0].toarray(), robust_laplacian(verts, faces)[0].toarray()),
+        )
+    )
 
 
-@_robust("connectivity", "case", ("pages of a book", "doubled faces", "faces in all directions", "a vertex of two fans",
-                                  "a face that names a vertex twice"), quick=("pages of a book",))  # fmt: skip
+@_robust(
+    "connectivity",
+    "case",
+    (
+        "pages of a book",
+        "doubled faces",
+        "faces in all directions",
+        "a vertex of two fans",
+        "a face that names a vertex twice",
+    ),
+    quick=("pages of a book",),
+)
 def _connectivity(case: str) -> Sample:
     verts, faces, area = _flat()
     if case == "pages of a book":
@@ -140,8 +170,14 @@ def _doubled(verts: np.ndarray, faces: np.ndarray, area: float) -> Sample:
     return Sample(max(relative(twice.toarray(), 2 * once.toarray()), relative(double, 2 * mass)))
 
 
-@_robust("what has no Laplacian", "case", ("NaN vertex", "no face", "unused vertex", "all in one place"),
-         quick=("NaN vertex", "all in one place"), oracle="a one-line refusal", refuses=lambda case: True)  # fmt: skip
+@_robust(
+    "what has no Laplacian",
+    "case",
+    ("NaN vertex", "no face", "unused vertex", "all in one place"),
+    quick=("NaN vertex", "all in one place"),
+    oracle="a one-line refusal",
+    refuses=lambda case: True,
+)
 def _refused(case: str) -> Sample:
     verts, faces, _ = _flat()
     if case == "NaN vertex":
@@ -157,9 +193,14 @@ def _refused(case: str) -> Sample:
 
 
 @cell(
-    "laplacian", "cotangent_laplacian", "obtuse triangles", "largest angle [deg]", (90.0, 120.0, 170.0, 179.9, 179.9999),
-    oracle="cotangents with 50 digits (mpmath)", exact=DOUBLE,
-)  # fmt: skip
+    "laplacian",
+    "cotangent_laplacian",
+    "obtuse triangles",
+    "largest angle [deg]",
+    (90.0, 120.0, 170.0, 179.9, 179.9999),
+    oracle="cotangents with 50 digits (mpmath)",
+    exact=DOUBLE,
+)
 def _cotangents(angle: float) -> Sample:
     import mpmath
 
@@ -180,9 +221,14 @@ def _cotangents(angle: float) -> Sample:
 
 
 @cell(
-    "laplacian", "cotangent_laplacian", "zero-area triangle", "height / edge [1]", (1.0, 1e-6, 0.0),
-    oracle="finite; rows sum to 0", exact=Tolerance(1e-6, 1.0),
-)  # fmt: skip
+    "laplacian",
+    "cotangent_laplacian",
+    "zero-area triangle",
+    "height / edge [1]",
+    (1.0, 1e-6, 0.0),
+    oracle="finite; rows sum to 0",
+    exact=Tolerance(1e-6, 1.0),
+)
 def _zero_area(height: float) -> Sample:
     verts, faces, _ = _flat()
     verts = np.concatenate((verts, [[1 / 6, -height / 3, 0.0]]))
@@ -191,9 +237,9 @@ def _zero_area(height: float) -> Sample:
     return Sample(max(relative(stiffness.sum(0), np.zeros(17)), 0.0 if np.isfinite(mass).all() else float("nan")))
 
 
-def _spectral(condition: str, axis: str, levels: tuple[Level, ...], **more: object):
+def _spectral(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
     more.setdefault("exact", Tolerance(1e-7, 1.0))
-    return cell("laplacian", "spectral_coordinates", condition, axis, levels, **more)  # type: ignore[arg-type]
+    return cell("laplacian", "spectral_coordinates", condition, axis, levels, **more)
 
 
 _INVARIANCE = "the mesh of unit size at the origin; residual of the eigenproblem"
@@ -205,10 +251,11 @@ def _same(verts: np.ndarray, faces: np.ndarray, size: float) -> Sample:
     found = spectral_coordinates(verts, faces, 5)
     return Sample(
         max(
-            relative(found.eigenvalues * size**2, plain.eigenvalues), relative(found.coords, plain.coords),
+            relative(found.eigenvalues * size**2, plain.eigenvalues),
+            relative(found.coords, plain.coords),
             float(found.residual.max()),
         )
-    )  # fmt: skip
+    )
 
 
 @_spectral("size of the mesh", "width [m]", (1.0, 1e-3, 1e-6, 1e-50, 1e6, 1e50), oracle=_INVARIANCE, quick=(1.0, 1e-50))
@@ -223,8 +270,13 @@ def _spectral_offset(offset: float) -> Sample:
     return _same(verts + offset * np.array([1.0, -0.7, 0.4]), faces, 1.0)
 
 
-@_spectral("needle", "height / edge of one face [1]", (0.5, 1e-2, 1e-4, 1e-6, 1e-12, 0.0), oracle="the eigenproblem",
-           limits=(Limit(lambda height: float(height) <= 1e-4, 1e-3, 1.0, "weights from 1 to 1e5 in one matrix"),))  # fmt: skip
+@_spectral(
+    "needle",
+    "height / edge of one face [1]",
+    (0.5, 1e-2, 1e-4, 1e-6, 1e-12, 0.0),
+    oracle="the eigenproblem",
+    limits=(Limit(lambda height: float(height) <= 1e-4, 1e-3, 1.0, "weights from 1 to 1e5 in one matrix"),),
+)
 def _spectral_needle(height: float) -> Sample:
     verts, faces = patch()
     a, b = verts[0], verts[4]
@@ -244,10 +296,15 @@ def _modes(modes: float) -> Sample:
 
 
 @cell(
-    "laplacian", "texel_values", "sliver under the texels", "height / edge of one face [1]", (1.0, 1e-2, 1e-4, 1e-8, 0.0),
-    oracle="the plane through the corners, clipped to twice their range", exact=Tolerance(1e-5, 1.0),
+    "laplacian",
+    "texel_values",
+    "sliver under the texels",
+    "height / edge of one face [1]",
+    (1.0, 1e-2, 1e-4, 1e-8, 0.0),
+    oracle="the plane through the corners, clipped to twice their range",
+    exact=Tolerance(1e-5, 1.0),
     limits=(Limit(lambda ratio: float(ratio) <= 1e-4, 2.0, 1.0, "the continuation over a sliver is clipped"),),
-)  # fmt: skip
+)
 def _texels(ratio: float) -> Sample:
     """A function linear in space on one triangle; a billboard that covers it."""
     verts = np.array([[0.0, 0, 0], [1, 0, 0], [0.4, ratio, 0]])

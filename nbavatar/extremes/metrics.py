@@ -57,16 +57,31 @@ def _ssim_true(x: Tensor, y: Tensor) -> float:
         return float(total / count)
 
 
-@cell("metrics", "psnr", "difference of the images", "difference [1]", (0.1, 1e-4, 1e-7, 1.0, 0.0), oracle=_DIGITS,
-      exact=_EXACT)  # fmt: skip
+@cell(
+    "metrics",
+    "psnr",
+    "difference of the images",
+    "difference [1]",
+    (0.1, 1e-4, 1e-7, 1.0, 0.0),
+    oracle=_DIGITS,
+    exact=_EXACT,
+)
 def _psnr_close(gap: float) -> Sample:
     x = torch.full((1, 3, 5, 5), 0.5 if gap < 0.5 else 0.0)
     y = x + gap
     return Sample(relative(psnr(x, y), _psnr_true(x, y)))
 
 
-@cell("metrics", "psnr", "pixels of the mask", "weight of all pixels [1]", (25.0, 1.0, 1e-3, 1e-30, 0.0), oracle=_DIGITS,
-      exact=_EXACT, refuses=lambda weight: weight == 0.0)  # fmt: skip
+@cell(
+    "metrics",
+    "psnr",
+    "pixels of the mask",
+    "weight of all pixels [1]",
+    (25.0, 1.0, 1e-3, 1e-30, 0.0),
+    oracle=_DIGITS,
+    exact=_EXACT,
+    refuses=lambda weight: weight == 0.0,
+)
 def _psnr_mask(weight: float) -> Sample | Refusal:
     x, y = _images(5)
     mask = torch.zeros(1, 5, 5)
@@ -84,15 +99,30 @@ def _nothing(found: Tensor) -> Sample | Refusal:
     return Refusal("NaN: the mask is empty") if bool(torch.isnan(found).all()) else Sample(math.nan)
 
 
-@cell("metrics", "ssim", "contrast of the images", "amplitude [1]", (0.5, 1e-2, 1e-4, 1e-6, 0.0), oracle=_DIGITS,
-      exact=_EXACT)  # fmt: skip
+@cell(
+    "metrics",
+    "ssim",
+    "contrast of the images",
+    "amplitude [1]",
+    (0.5, 1e-2, 1e-4, 1e-6, 0.0),
+    oracle=_DIGITS,
+    exact=_EXACT,
+)
 def _ssim_contrast(amplitude: float) -> Sample:
     x, y = (0.4 + amplitude * (image - 0.5) for image in _images(12))
     return Sample(relative(ssim(x, y), _ssim_true(x, y)))
 
 
-@cell("metrics", "ssim", "constant images", "levels", ("0 and 0", "0 and 1", "1 and 1", "0.3 and 0.7"), oracle=_DIGITS,
-      exact=_EXACT, quick=("0 and 0", "0 and 1"))  # fmt: skip
+@cell(
+    "metrics",
+    "ssim",
+    "constant images",
+    "levels",
+    ("0 and 0", "0 and 1", "1 and 1", "0.3 and 0.7"),
+    oracle=_DIGITS,
+    exact=_EXACT,
+    quick=("0 and 0", "0 and 1"),
+)
 def _ssim_constant(levels: str) -> Sample:
     a, b = (float(value) for value in levels.split(" and "))
     x, y = torch.full((1, 3, 12, 12), a), torch.full((1, 3, 12, 12), b)
@@ -101,8 +131,16 @@ def _ssim_constant(levels: str) -> Sample:
     return Sample(relative(ssim(x, y), _ssim_true(x, y)), error)
 
 
-@cell("metrics", "ssim", "pixels of the mask", "weight of all pixels [1]", (4.0, 1.0, 1e-30, 0.0), oracle="single window",
-      exact=_EXACT, refuses=lambda weight: weight == 0.0)  # fmt: skip
+@cell(
+    "metrics",
+    "ssim",
+    "pixels of the mask",
+    "weight of all pixels [1]",
+    (4.0, 1.0, 1e-30, 0.0),
+    oracle="single window",
+    exact=_EXACT,
+    refuses=lambda weight: weight == 0.0,
+)
 def _ssim_mask(weight: float) -> Sample | Refusal:
     x, y = _images(12)
     mask = torch.zeros(1, 12, 12)
@@ -112,10 +150,15 @@ def _ssim_mask(weight: float) -> Sample | Refusal:
 
 
 @cell(
-    "metrics", "psnr and ssim", "what cannot be judged", "case",
-    ("NaN pixel", "bytes", "values of 255", "sizes differ", "ten pixels for SSIM", "NaN mask"), quick=("NaN pixel",),
-    oracle="a one-line refusal", refuses=lambda case: True,
-)  # fmt: skip
+    "metrics",
+    "psnr and ssim",
+    "what cannot be judged",
+    "case",
+    ("NaN pixel", "bytes", "values of 255", "sizes differ", "ten pixels for SSIM", "NaN mask"),
+    quick=("NaN pixel",),
+    oracle="a one-line refusal",
+    refuses=lambda case: True,
+)
 def _refused(case: str) -> Sample:
     x, y = _images()
     if case == "NaN pixel":
@@ -154,25 +197,47 @@ def _lpips(x: Tensor, y: Tensor, *, bound: float = 0.0) -> Sample:
 _NET = "the same network in float64"
 
 
-@cell("metrics", "lpips float32", "difference of the images", "standard deviation [1]", (0.1, 1e-2, 1e-4, 1e-6, 0.0),
-      oracle=_NET, quick=(0.1, 0.0),
-      limits=(Limit(lambda gap: 0 < float(gap) <= 1e-2, 1e-4, 5e-2, "the difference of two nearly equal unit vectors"),))  # fmt: skip
+@cell(
+    "metrics",
+    "lpips float32",
+    "difference of the images",
+    "standard deviation [1]",
+    (0.1, 1e-2, 1e-4, 1e-6, 0.0),
+    oracle=_NET,
+    quick=(0.1, 0.0),
+    limits=(Limit(lambda gap: 0 < float(gap) <= 1e-2, 1e-4, 5e-2, "the difference of two nearly equal unit vectors"),),
+)
 def _lpips_close(gap: float) -> Sample:
     x, _ = _images(40)
     noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(9))
     return _lpips(x, (x + gap * noise).clamp(0, 1))
 
 
-@cell("metrics", "lpips float32", "constant images", "levels", ("0 and 0", "0 and 1", "1 and 1", "0.5 and 0.5"),
-      oracle=_NET, quick=("0 and 0",),
-      limits=(Limit(lambda case: case == "0 and 1", 1e-5, 1e-3, "activations at a kink of a rectifier"),))  # fmt: skip
+@cell(
+    "metrics",
+    "lpips float32",
+    "constant images",
+    "levels",
+    ("0 and 0", "0 and 1", "1 and 1", "0.5 and 0.5"),
+    oracle=_NET,
+    quick=("0 and 0",),
+    limits=(Limit(lambda case: case == "0 and 1", 1e-5, 1e-3, "activations at a kink of a rectifier"),),
+)
 def _lpips_constant(levels: Level) -> Sample:
     a, b = (float(value) for value in str(levels).split(" and "))
     return _lpips(torch.full((1, 3, 40, 40), a), torch.full((1, 3, 40, 40), b))
 
 
-@cell("metrics", "lpips float32", "what cannot be judged", "case", ("30 pixels", "one channel", "sizes differ"),
-      oracle="a one-line refusal", quick=("30 pixels",), refuses=lambda case: True)  # fmt: skip
+@cell(
+    "metrics",
+    "lpips float32",
+    "what cannot be judged",
+    "case",
+    ("30 pixels", "one channel", "sizes differ"),
+    oracle="a one-line refusal",
+    quick=("30 pixels",),
+    refuses=lambda case: True,
+)
 def _lpips_refused(case: Level) -> Sample:
     x, y = _images(40)
     module = load_lpips("alex")

@@ -8,6 +8,7 @@ the tolerance, or the flag `exceeded`.
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import numpy as np
 
@@ -31,24 +32,43 @@ def _relax(x: np.ndarray, rest: np.ndarray, **given: object) -> tuple[np.ndarray
     """`relax` with everything off that is not named; positions and impulses after it."""
     count = len(x)
     values: dict[str, object] = {
-        "inverse_mass": np.ones(count), "active": np.arange(count), "support": np.zeros(count),
-        "edges": np.zeros((0, 2), np.int64), "lengths": np.zeros(0), "stretch": 0.0, "shear": 0.0,
-        "ring": np.zeros(count + 1, np.int64), "ring_ids": np.zeros(0, np.int64), "ring_weights": np.zeros(0),
-        "bend": np.zeros(count), "faces": _NO_IDS, "bulge": np.ones(count), "volume_stiffness": 0.0,
-        "contacts": np.zeros((0, 9)), "ids": _NO_IDS, "weights": np.zeros((0, 3)), "hand": np.zeros(0, np.int64),
-        "pose": np.zeros((1, 6)), "pose_inverse_mass": np.zeros((1, 2)), "pose_stiffness": np.zeros(2),
-        "pose_bound": np.full(2, np.inf), "centre": np.zeros((1, 3)), "dt": 2e-3, "iterations": 8, "friction": 0.0,
+        "inverse_mass": np.ones(count),
+        "active": np.arange(count),
+        "support": np.zeros(count),
+        "edges": np.zeros((0, 2), np.int64),
+        "lengths": np.zeros(0),
+        "stretch": 0.0,
+        "shear": 0.0,
+        "ring": np.zeros(count + 1, np.int64),
+        "ring_ids": np.zeros(0, np.int64),
+        "ring_weights": np.zeros(0),
+        "bend": np.zeros(count),
+        "faces": _NO_IDS,
+        "bulge": np.ones(count),
+        "volume_stiffness": 0.0,
+        "contacts": np.zeros((0, 9)),
+        "ids": _NO_IDS,
+        "weights": np.zeros((0, 3)),
+        "hand": np.zeros(0, np.int64),
+        "pose": np.zeros((1, 6)),
+        "pose_inverse_mass": np.zeros((1, 2)),
+        "pose_stiffness": np.zeros(2),
+        "pose_bound": np.full(2, np.inf),
+        "centre": np.zeros((1, 3)),
+        "dt": 2e-3,
+        "iterations": 8,
+        "friction": 0.0,
         "max_dent": np.inf,
-    } | given  # fmt: skip
+    } | given
     x = x.copy()
     pressed = relax(x, rest, *values.values())
     return x, pressed
 
 
-def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: object):
+def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
     more.setdefault("oracle", _CLOSED)
     more.setdefault("exact", _EXACT)
-    return cell("physics", "relax", condition, axis, levels, **more)  # type: ignore[arg-type]
+    return cell("physics", "relax", condition, axis, levels, **more)
 
 
 def _bed(stiffness: float, dt: float, iterations: int = 8) -> Sample:
@@ -61,8 +81,12 @@ def _bed(stiffness: float, dt: float, iterations: int = 8) -> Sample:
     return Sample(relative(found, x * (1 / (1 + stiffness / inertia))))
 
 
-@_cell("stiffness of the bed", "stiffness [N/m]", _STIFF,
-       limits=(Limit(lambda k: float(k) >= 1e300, 1.0, 1.0, "a rest of 1e-300 is rounding of the rest place"),))  # fmt: skip
+@_cell(
+    "stiffness of the bed",
+    "stiffness [N/m]",
+    _STIFF,
+    limits=(Limit(lambda k: float(k) >= 1e300, 1.0, 1.0, "a rest of 1e-300 is rounding of the rest place"),),
+)
 def _bed_stiffness(stiffness: float) -> Sample:
     return _bed(stiffness, 2e-3)
 
@@ -80,8 +104,15 @@ def _bed_iterations(iterations: float) -> Sample:
 def _edge(stiffness: float, dt: float, length: float = 0.01, now: float = 0.013) -> Sample:
     rest = np.array([[0.0, 0, 0], [length, 0, 0]])
     x = np.array([[0.0, 0, 0], [now, 0, 0]])
-    found, _ = _relax(x, rest, edges=np.array([[0, 1]]), lengths=np.array([length]), stretch=stiffness, dt=dt,
-                      inverse_mass=np.array([50.0, 20.0]))  # fmt: skip
+    found, _ = _relax(
+        x,
+        rest,
+        edges=np.array([[0, 1]]),
+        lengths=np.array([length]),
+        stretch=stiffness,
+        dt=dt,
+        inverse_mass=np.array([50.0, 20.0]),
+    )
     # Two masses and a spring along a line: the common centre stays, the length goes to the weighted mean.
     inertia = 1 / 70.0 / dt / dt
     gap = length + (now - length) / (1 + stiffness / inertia)
@@ -100,8 +131,12 @@ def _edge_step(dt: float) -> Sample:
     return _edge(30.0, dt)
 
 
-@_cell("length of an edge", "length now [m]", (0.013, 1e-6, 1e-11, 1e-13, 0.0),
-       limits=(Limit(lambda now: 0 <= float(now) < 1e-12, 5.0, 1.0, "an edge of no length has no direction: left alone"),))  # fmt: skip
+@_cell(
+    "length of an edge",
+    "length now [m]",
+    (0.013, 1e-6, 1e-11, 1e-13, 0.0),
+    limits=(Limit(lambda now: 0 <= float(now) < 1e-12, 5.0, 1.0, "an edge of no length has no direction: left alone"),),
+)
 def _edge_length(now: float) -> Sample:
     return _edge(30.0, 2e-3, now=now)
 
@@ -113,9 +148,16 @@ def _plate(stiffness: float) -> Sample:
     rest = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.02, 0, 0]])
     r, dt = 5e3, 2e-3
     found, _ = _relax(
-        x, rest, inverse_mass=np.array([0.0, 50.0, 0.0]), active=np.array([1]), ring=np.array([0, 0, 2, 2]),
-        ring_ids=np.array([0, 2]), ring_weights=np.array([r, r]), bend=np.array([0.0, stiffness, 0.0]), dt=dt,
-    )  # fmt: skip
+        x,
+        rest,
+        inverse_mass=np.array([0.0, 50.0, 0.0]),
+        active=np.array([1]),
+        ring=np.array([0, 0, 2, 2]),
+        ring_ids=np.array([0, 2]),
+        ring_weights=np.array([r, r]),
+        bend=np.array([0.0, stiffness, 0.0]),
+        dt=dt,
+    )
     inertia = 1 / 50.0 / dt / dt
     # |C| = 2 r u: a spring of 4 r^2 k against inertia.
     shrink = 1 / (1 + 4 * r * r * (stiffness / inertia))
@@ -130,9 +172,15 @@ def _contact(depth: float, **given: object) -> tuple[np.ndarray, np.ndarray]:
     contact[0, :3] = contact[0, 3:6] = [0.0, 0.0, -depth]
     contact[0, 8] = 1.0
     return _relax(
-        np.zeros((1, 3)), np.zeros((1, 3)), contacts=contact, ids=np.zeros((1, 3), np.int64),
-        weights=np.array([[1.0, 0, 0]]), hand=np.zeros(1, np.int64), inverse_mass=np.array([50.0]), **given,
-    )  # fmt: skip
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+        contacts=contact,
+        ids=np.zeros((1, 3), np.int64),
+        weights=np.array([[1.0, 0, 0]]),
+        hand=np.zeros(1, np.int64),
+        inverse_mass=np.array([50.0]),
+        **given,
+    )
 
 
 @_cell("penetration", "depth [m]", (1e-3, 1e-9, 0.0, -1e-3, 0.1, 10.0))
@@ -153,9 +201,15 @@ def _friction(coefficient: float) -> Sample:
     """The hand slides 4 mm along x while pressing 1 mm deep: Coulomb's cone, or sticking."""
     contact = np.array([[4e-3, 0.0, -1e-3, 0.0, 0.0, -1e-3, 0, 0, 1.0]])
     found, _ = _relax(
-        np.zeros((1, 3)), np.zeros((1, 3)), contacts=contact, ids=np.zeros((1, 3), np.int64), friction=coefficient,
-        weights=np.array([[1.0, 0, 0]]), hand=np.zeros(1, np.int64), inverse_mass=np.array([50.0]),
-    )  # fmt: skip
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+        contacts=contact,
+        ids=np.zeros((1, 3), np.int64),
+        friction=coefficient,
+        weights=np.array([[1.0, 0, 0]]),
+        hand=np.zeros(1, np.int64),
+        inverse_mass=np.array([50.0]),
+    )
     return Sample(relative(found, [[min(4e-3, coefficient * 1e-3), 0, -1e-3]]))
 
 
@@ -169,13 +223,23 @@ def _weighted(inverse: float) -> tuple[np.ndarray, np.ndarray]:
     contact = np.zeros((1, 9))
     contact[0, 2], contact[0, 5], contact[0, 8] = -1e-3, -1e-3, 1.0
     return _relax(
-        np.zeros((1, 3)), np.zeros((1, 3)), contacts=contact, ids=np.zeros((1, 3), np.int64),
-        weights=np.array([[1.0, 0, 0]]), hand=np.zeros(1, np.int64), inverse_mass=np.array([inverse]),
-    )  # fmt: skip
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+        contacts=contact,
+        ids=np.zeros((1, 3), np.int64),
+        weights=np.array([[1.0, 0, 0]]),
+        hand=np.zeros(1, np.int64),
+        inverse_mass=np.array([inverse]),
+    )
 
 
-@_cell("resistance to loss of volume", "stiffness [N/m^5]", (3e8, 0.0, 1e-3, 1e13, 1e15, 1e30),
-       unit="share of the loss", exact=Tolerance(1e-3, 1.0))  # fmt: skip
+@_cell(
+    "resistance to loss of volume",
+    "stiffness [N/m^5]",
+    (3e8, 0.0, 1e-3, 1e13, 1e15, 1e30),
+    unit="share of the loss",
+    exact=Tolerance(1e-3, 1.0),
+)
 def _volume(stiffness: float) -> Sample:
     """A tetrahedron pressed by a micrometre at one corner: one constraint, linear to 1e-4."""
     rest = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]])
@@ -202,16 +266,24 @@ def _scene(vertices: int = 900) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     return head, faces, hand, hand_faces
 
 
-def _frame(condition: str, axis: str, levels: tuple[Level, ...], **more: object):
+def _frame(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
     more.setdefault("oracle", "depth left, or the flag `exceeded`")
-    return cell("physics", "ContactSolver", condition, axis, levels, unit="depth left / tolerance",
-                exact=Tolerance(2.0, 1.0), **more)  # type: ignore[arg-type] # fmt: skip
+    return cell(
+        "physics",
+        "ContactSolver",
+        condition,
+        axis,
+        levels,
+        unit="depth left / tolerance",
+        exact=Tolerance(2.0, 1.0),
+        **more,
+    )
 
 
 def _press(depth: float, *, before: float | None = None, hands: int = 1, **numbers: object) -> Sample | Refusal:
     """One frame (or a second one, after a frame at another depth); depth left in units of the tolerance."""
     head, faces, hand, hand_faces = _scene()
-    model = dataclasses.replace(ContactNumbers(), **numbers)  # type: ignore[arg-type]
+    model = dataclasses.replace(ContactNumbers(), **numbers)
     surface = soft_surface(head, faces, bed_stiffness(tissue_thickness(head, faces), 2e4))
     solver = ContactSolver(surface, head, [(hand, hand_faces)] * hands, model)
     now = [press(hand, depth)] * hands
@@ -232,8 +304,13 @@ def _press(depth: float, *, before: float | None = None, hands: int = 1, **numbe
     )
 
 
-@_frame("penetration", "depth [m]", (2e-3, -1e-2, 5e-4, 8e-3, 0.02, 0.05, 0.1), quick=(2e-3,),
-        refuses=lambda depth: float(depth) >= 8e-3)  # fmt: skip
+@_frame(
+    "penetration",
+    "depth [m]",
+    (2e-3, -1e-2, 5e-4, 8e-3, 0.02, 0.05, 0.1),
+    quick=(2e-3,),
+    refuses=lambda depth: float(depth) >= 8e-3,
+)
 def _press_depth(depth: float) -> Sample | Refusal:
     return _press(depth)
 
@@ -248,12 +325,18 @@ def _press_step(dt: float) -> Sample | Refusal:
     return _press(3e-3, time_step=dt)
 
 
-@_frame("stiffness of the skin", "all stiffnesses times [1]", (1.0, 0.0, 1e-6, 1e6, 1e12), quick=(),
-        refuses=lambda factor: float(factor) >= 1e6)  # fmt: skip
+@_frame(
+    "stiffness of the skin",
+    "all stiffnesses times [1]",
+    (1.0, 0.0, 1e-6, 1e6, 1e12),
+    quick=(),
+    refuses=lambda factor: float(factor) >= 1e6,
+)
 def _press_stiffness(factor: float) -> Sample | Refusal:
     n = ContactNumbers()
-    return _press(3e-3, stretch=n.stretch * factor, shear=n.shear * factor, bending=n.bending * factor,
-                  volume=n.volume * factor)  # fmt: skip
+    return _press(
+        3e-3, stretch=n.stretch * factor, shear=n.shear * factor, bending=n.bending * factor, volume=n.volume * factor
+    )
 
 
 @_frame("two hands in one place", "hands [1]", (1.0, 2.0), quick=(), refuses=lambda hands: False)
@@ -261,8 +344,15 @@ def _press_two(hands: float) -> Sample | Refusal:
     return _press(2e-3, hands=int(hands))
 
 
-@cell("physics", "rigid_motion", "points", "case", ("solid", "flat", "a line", "one point", "mirrored", "1e4 m away"),
-      oracle="the motion itself, where the points determine it; a rotation elsewhere", exact=Tolerance(1e-9, 1.0))  # fmt: skip
+@cell(
+    "physics",
+    "rigid_motion",
+    "points",
+    "case",
+    ("solid", "flat", "a line", "one point", "mirrored", "1e4 m away"),
+    oracle="the motion itself, where the points determine it; a rotation elsewhere",
+    exact=Tolerance(1e-9, 1.0),
+)
 def _rigid(case: Level) -> Sample:
     random = np.random.default_rng(1)
     points = random.normal(size=(9, 3))
@@ -280,8 +370,15 @@ def _rigid(case: Level) -> Sample:
     return Sample(max(proper, relative(points @ rotation.T + shift - place, target - place, least=1.0)))
 
 
-@cell("physics", "bed_stiffness", "thickness of the tissue", "thickness [m]", (0.01, 1e-3, 1e-9, 1.0), oracle=_CLOSED,
-      exact=Tolerance(1e-12, 1.0))  # fmt: skip
+@cell(
+    "physics",
+    "bed_stiffness",
+    "thickness of the tissue",
+    "thickness [m]",
+    (0.01, 1e-3, 1e-9, 1.0),
+    oracle=_CLOSED,
+    exact=Tolerance(1e-12, 1.0),
+)
 def _thickness(thickness: float) -> Sample:
     return Sample(
         relative(bed_stiffness(np.array([thickness]), 2e4), [2e4 / thickness * (1 + (0.01 / thickness) ** 2)])

@@ -71,10 +71,15 @@ def heat_map(rows: Sequence[Row]) -> "Figure":
     legend = [
         Patch(color=_blue(_DEEPEST), label="exact, far below the border"),
         Patch(color=_blue(0.0), label="exact, at the border"),
-        *(Patch(color=_COLOURS[v], label=f"{_LETTERS[v]}: {text}") for v, text in (
-            ("degrades", "degrades within its stated bound"), ("refuses", "refuses, with the cause"), ("defect", "defect"),
-        )),
-    ]  # fmt: skip
+        *(
+            Patch(color=_COLOURS[v], label=f"{_LETTERS[v]}: {text}")
+            for v, text in (
+                ("degrades", "degrades within its stated bound"),
+                ("refuses", "refuses, with the cause"),
+                ("defect", "defect"),
+            )
+        ),
+    ]
     figure.legend(handles=legend, loc="lower center", ncols=3, fontsize=7, frameon=False)
     return figure
 
@@ -130,9 +135,10 @@ def _panel(axis: "Axes", group: Sequence[Row], border: tuple[float, float]) -> N
     axis.minorticks_off()
     first = group[0]
     axis.set_xlim(-0.4, len(group) - 0.6)
-    axis.set_xticks(range(len(group)), [format_level(row.level) for row in group], rotation=45, ha="right",
-                    rotation_mode="anchor")  # fmt: skip
-    axis.set_title(f"{first.kernel}\n{first.condition}", fontsize=7)
+    axis.set_xticks(
+        range(len(group)), [format_level(row.level) for row in group], rotation=45, ha="right", rotation_mode="anchor"
+    )
+    axis.set_title(f"{first.family}: {first.kernel}\n{first.condition}", fontsize=7)
     axis.set_xlabel(first.axis, fontsize=6.5)
     axis.set_ylabel(f"error [{first.unit}]", fontsize=6.5)
     axis.tick_params(labelsize=5.5)

@@ -1,5 +1,7 @@
 """Cells of the projection that all rasterizer backends share, in float64, against ray-plane intersection in mpmath."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -16,8 +18,14 @@ _ORACLE = "ray-plane intersection, 50 digits (mpmath)"
 _EXACT = Tolerance(1e-9, 1e-8)
 
 
-def _intersect(means: np.ndarray, quats: np.ndarray, extents: np.ndarray, view: np.ndarray, K: np.ndarray,
-               pixel: tuple[float, float]) -> tuple[object, object, object]:  # fmt: skip
+def _intersect(
+    means: np.ndarray,
+    quats: np.ndarray,
+    extents: np.ndarray,
+    view: np.ndarray,
+    K: np.ndarray,
+    pixel: tuple[float, float],
+) -> tuple[object, object, object]:
     """Texture coordinates (u, v) and inverse depth of one billboard at one pixel, in mpmath."""
     from mpmath import mpf
 
@@ -40,15 +48,15 @@ def _intersect(means: np.ndarray, quats: np.ndarray, extents: np.ndarray, view: 
     return point @ axes[:, 0] / extents[0], point @ axes[:, 1] / extents[1], 1 / depth
 
 
-def _measure(tensors: list[Tensor], view: Tensor | None = None, K: Tensor | None = None) -> Sample:
+def _measure(tensors: list[Tensor], pose: Tensor | None = None, matrix: Tensor | None = None) -> Sample:
     """Errors at a pixel within the billboard of (u, v, 1/z), and of the gradient of a mix of u and v.
 
     The inverse depth only settles the order of hits and has no gradient.
     """
     import mpmath
 
-    view = torch.eye(4, dtype=torch.float64) if view is None else view
-    K = camera() if K is None else K
+    view = pose if pose is not None else torch.eye(4, dtype=torch.float64)
+    K = matrix if matrix is not None else camera()
     inputs = [tensor[:1].double() for tensor in tensors[:3]]
     centre = view[:3, :3] @ inputs[0][0] + view[:3, 3]
     middle = K @ (centre / centre[2])
@@ -66,30 +74,29 @@ def _measure(tensors: list[Tensor], view: Tensor | None = None, K: Tensor | None
     found = gradients(loss, inputs)[1]
     with mpmath.workdps(60):
         exact = [precise(tensor[0].numpy()) for tensor in inputs]
-        matrix, intrinsics = precise(view.numpy()), precise(K.numpy())
+        motion, intrinsics = precise(view.numpy()), precise(K.numpy())
         weights = precise(mix.numpy())
 
         def truth(*arrays: np.ndarray) -> object:
-            return sum(a * b for a, b in zip(_intersect(*arrays, matrix, intrinsics, pixel), weights, strict=True))
+            return sum(a * b for a, b in zip(_intersect(*arrays, motion, intrinsics, pixel), weights, strict=True))
 
-        true = np.array([float(value) for value in _intersect(*exact, matrix, intrinsics, pixel)])  # type: ignore[arg-type]
-        slopes = [
-            derivative(lambda moved, k=k: truth(*exact[:k], moved, *exact[k + 1 :]), exact[k])
-            for k in range(3)
-        ]  # fmt: skip
+        true = np.array([float(value) for value in _intersect(*exact, motion, intrinsics, pixel)])
+        slopes = [derivative(lambda moved, k=k: truth(*exact[:k], moved, *exact[k + 1 :]), exact[k]) for k in range(3)]
     return Sample(
         max(relative(v, t) for v, t in zip(values[0].detach(), true, strict=True)), gradient_error(found, slopes)
     )
 
 
-def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: object):
-    return cell("projection", "float64", condition, axis, levels, oracle=_ORACLE, exact=_EXACT, **more)  # type: ignore[arg-type]
+def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
+    return cell("projection", "float64", condition, axis, levels, oracle=_ORACLE, exact=_EXACT, **more)
 
 
 @_cell(
-    "grazing view", "angle to the plane [deg]", (45.0, 10.0, 1.0, 0.1, 1e-2, 1e-4, 1e-6),
+    "grazing view",
+    "angle to the plane [deg]",
+    (45.0, 10.0, 1.0, 0.1, 1e-2, 1e-4, 1e-6),
     limits=(Limit(lambda angle: float(angle) <= 1e-2, 1e-6, 1e-5, "n . c loses digits in proportion to the angle"),),
-)  # fmt: skip
+)
 def _grazing(angle: float) -> Sample:
     tensors = tilted(45.0, count=1)
     half = 0.5 * np.radians(90.0 - angle)
@@ -110,17 +117,21 @@ def _depth(depth: float) -> Sample:
 
 
 @_cell(
-    "small and far", "depth / half-extent [1]", (10.0, 1e3, 1e5, 1e7),
+    "small and far",
+    "depth / half-extent [1]",
+    (10.0, 1e3, 1e5, 1e7),
     limits=(Limit(lambda ratio: float(ratio) >= 1e7, 1e-7, 1e-6, "differences of cross products of far vectors"),),
-)  # fmt: skip
+)
 def _far(ratio: float) -> Sample:
     return _measure(tilted(40.0, size=1.0 / ratio, count=1))
 
 
 @_cell(
-    "scene far from the origin", "offset [m]", (0.0, 1.0, 1e2, 1e4, 1e6),
+    "scene far from the origin",
+    "offset [m]",
+    (0.0, 1.0, 1e2, 1e4, 1e6),
     limits=(Limit(lambda offset: float(offset) >= 1e4, 1e-8, 1e-7, "R m + t is right to 1e-16 of the offset"),),
-)  # fmt: skip
+)
 def _offset(offset: float) -> Sample:
     tensors = tilted(40.0, count=1)
     rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
@@ -140,30 +151,44 @@ def _offset(offset: float) -> Sample:
 
 @_cell("focal length", "f [px]", (24.0, 1.0, 1e4, 1e8))
 def _focal(focal: float) -> Sample:
-    return _measure(tilted(40.0, count=1), K=camera(focal))
+    return _measure(tilted(40.0, count=1), matrix=camera(focal))
 
 
 @_cell(
-    "principal point off the image", "shift [px]", (0.0, 1e3, 1e6, 1e9),
+    "principal point off the image",
+    "shift [px]",
+    (0.0, 1e3, 1e6, 1e9),
     limits=(Limit(lambda shift: float(shift) >= 1e9, 1e-5, 1e-5, "pixel coordinates have 53 bits"),),
-)  # fmt: skip
+)
 def _principal(shift: float) -> Sample:
-    return _measure(tilted(40.0, count=1), K=camera(24.0 + shift, shift, -shift))
+    return _measure(tilted(40.0, count=1), matrix=camera(24.0 + shift, shift, -shift))
 
 
 @cell(
-    "projection", "pinhole project", "points far from the origin, float32", "offset [m]", (0.0, 10.0, 1e2, 1e3, 1e4),
-    oracle="float64 on the same numbers", unit="px", exact=Tolerance(1e-2, 1e-4),
+    "projection",
+    "pinhole project",
+    "points far from the origin, float32",
+    "offset [m]",
+    (0.0, 10.0, 1e2, 1e3, 1e4),
+    oracle="float64 on the same numbers",
+    unit="px",
+    exact=Tolerance(1e-2, 1e-4),
     limits=(Limit(lambda offset: float(offset) >= 1e2, 5.0, 1.0, "float32 holds 1e-7 of the offset; use float64"),),
-)  # fmt: skip
+)
 def _pinhole_single(offset: float) -> Sample:
     return _pinhole(offset, np.float32)
 
 
 @cell(
-    "projection", "pinhole project", "points far from the origin, float64", "offset [m]", (0.0, 1e2, 1e4, 1e6),
-    oracle="50 digits (mpmath)", unit="px", exact=Tolerance(1e-6, 1e-6),
-)  # fmt: skip
+    "projection",
+    "pinhole project",
+    "points far from the origin, float64",
+    "offset [m]",
+    (0.0, 1e2, 1e4, 1e6),
+    oracle="50 digits (mpmath)",
+    unit="px",
+    exact=Tolerance(1e-6, 1e-6),
+)
 def _pinhole_double(offset: float) -> Sample:
     return _pinhole(offset, np.float64)
 
@@ -188,9 +213,14 @@ def _pinhole(offset: float, dtype: type) -> Sample:
 
 
 @cell(
-    "projection", "pinhole project", "points at depth 0 and behind", "depth [m]", (1.0, 1e-6, 1e-30, -1.0),
-    oracle="50 digits (mpmath)", exact=DOUBLE,
-)  # fmt: skip
+    "projection",
+    "pinhole project",
+    "points at depth 0 and behind",
+    "depth [m]",
+    (1.0, 1e-6, 1e-30, -1.0),
+    oracle="50 digits (mpmath)",
+    exact=DOUBLE,
+)
 def _pinhole_depth(depth: float) -> Sample:
     K = np.array([[1000.0, 0, 512], [0, 1000.0, 512], [0, 0, 1]])
     pixels, found = project(np.array([[0.5 * depth, -0.25 * depth, depth]]), K, np.eye(4))

@@ -6,6 +6,7 @@ have cells of their own.
 """
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -120,8 +121,8 @@ def compare(scene: Scene, *, every_pixel: bool = False) -> Sample:
     return Sample(relative(images["cpu"], images["reference"], least=1e-6), gradient)
 
 
-def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: object):
-    return cell("raster", "cpu float32", condition, axis, levels, oracle=_ORACLE, **more)  # type: ignore[arg-type]
+def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
+    return cell("raster", "cpu float32", condition, axis, levels, oracle=_ORACLE, **more)
 
 
 @_cell("grazing view", "angle to the plane [deg]", (45.0, 10.0, 3.0, 1.0, 0.1, 0.01, 1e-3, 0.0))
@@ -130,17 +131,23 @@ def _grazing(angle: float) -> Sample:
 
 
 @_cell(
-    "grazing view, no low-pass", "angle to the plane [deg]", (45.0, 10.0, 3.0, 1.0, 0.1, 0.01, 1e-3, 0.0),
+    "grazing view, no low-pass",
+    "angle to the plane [deg]",
+    (45.0, 10.0, 3.0, 1.0, 0.1, 0.01, 1e-3, 0.0),
     limits=(Limit(lambda a: 0 < float(a) <= 1, 1e-3, 5e-2, "hits cover a sliver of the pixel grid"),),
-)  # fmt: skip
+)
 def _grazing_sharp(angle: float) -> Sample:
     return compare(Scene(tilted(angle), camera(), low_pass=0.0))
 
 
 @_cell(
-    "sub-pixel size", "half-extent on screen [px]", (10.0, 1.0, 0.3, 0.1, 1e-2, 1e-3, 1e-5, 0.0),
-    limits=(Limit(lambda size: float(size) <= 0.01, 1e-3, 1e-4, "opacity 1 - T is right to 6e-8 of full, not of itself"),),
-)  # fmt: skip
+    "sub-pixel size",
+    "half-extent on screen [px]",
+    (10.0, 1.0, 0.3, 0.1, 1e-2, 1e-3, 1e-5, 0.0),
+    limits=(
+        Limit(lambda size: float(size) <= 0.01, 1e-3, 1e-4, "opacity 1 - T is right to 6e-8 of full, not of itself"),
+    ),
+)
 def _small(pixels: float) -> Sample:
     tensors = billboards(6)
     tensors[2] = torch.full_like(tensors[2], pixels / 24.0)
@@ -155,13 +162,19 @@ def _line(pixels: float) -> Sample:
 
 
 @_cell(
-    "screen-filling size", "half-extent [image widths]", (0.5, 2.0, 10.0, 100.0, 1e3, 1e4, 1e6),
+    "screen-filling size",
+    "half-extent [image widths]",
+    (0.5, 2.0, 10.0, 100.0, 1e3, 1e4, 1e6),
     limits=tuple(
-        Limit(lambda widths, most=most: float(widths) == most, 1e-5, 1e-6 * most,
-              "the image is a small part of one texel, whose coordinates have 24 bits")
+        Limit(
+            lambda widths, most=most: float(widths) == most,
+            1e-5,
+            1e-6 * most,
+            "the image is a small part of one texel, whose coordinates have 24 bits",
+        )
         for most in (1e3, 1e4, 1e6)
     ),
-)  # fmt: skip
+)
 def _large(widths: float) -> Sample:
     tensors = tilted(80.0)
     tensors[2] = torch.full_like(tensors[2], widths)
@@ -259,9 +272,11 @@ def _stack(layers: int, *, spread: float) -> Scene:
 
 
 @_cell(
-    "alpha of all texels", "alpha [1]", (0.5, 0.1, 1 / 255, 1e-3, 1e-30, 0.0, 0.98, 0.99, 0.999, 1.0),
+    "alpha of all texels",
+    "alpha [1]",
+    (0.5, 0.1, 1 / 255, 1e-3, 1e-30, 0.0, 0.98, 0.99, 0.999, 1.0),
     limits=(Limit(lambda a: a == 0.99, 1e-5, 2.0, "on the cap the slope is 0 or 1, and rounding says which"),),
-)  # fmt: skip
+)
 def _alpha(value: float) -> Sample:
     tensors = tilted(50.0)
     tensors[4] = torch.full_like(tensors[4], value)
@@ -307,11 +322,26 @@ def _orders(order: str) -> Sample:
 
 
 @cell(
-    "raster", "arguments", "what has no image", "case",
-    ("NaN mean", "infinite extent", "NaN quaternion", "zero quaternion", "NaN alpha", "NaN camera", "focal length 0",
-     "image without pixels", "near 0", "unknown order"),
-    quick=("NaN mean", "NaN alpha"), oracle="a one-line refusal", refuses=lambda case: True,
-)  # fmt: skip
+    "raster",
+    "arguments",
+    "what has no image",
+    "case",
+    (
+        "NaN mean",
+        "infinite extent",
+        "NaN quaternion",
+        "zero quaternion",
+        "NaN alpha",
+        "NaN camera",
+        "focal length 0",
+        "image without pixels",
+        "near 0",
+        "unknown order",
+    ),
+    quick=("NaN mean", "NaN alpha"),
+    oracle="a one-line refusal",
+    refuses=lambda case: True,
+)
 def _refused(case: str) -> Sample:
     tensors, K, width, options = billboards(3), camera(), _SIZE, {}
     viewmat = torch.eye(4)

@@ -1,6 +1,7 @@
 """Cells of the rotations, float32 against 50 digits: at the identity, at half turns, at extreme norms."""
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,9 +47,8 @@ def _matrix(q: np.ndarray) -> np.ndarray:
     )
 
 
-def _vector_cell(kernel: str, condition: str, levels: tuple[float, ...], quick: tuple[float, ...], **more: object):
-    return cell("rotations", kernel, condition, "angle [rad]", levels, quick=quick, oracle="50 digits (mpmath)",
-                **more)  # type: ignore[arg-type] # fmt: skip
+def _vector_cell(kernel: str, condition: str, levels: tuple[float, ...], quick: tuple[float, ...], **more: Any):
+    return cell("rotations", kernel, condition, "angle [rad]", levels, quick=quick, oracle="50 digits (mpmath)", **more)
 
 
 def _from_vector(function, truth, angle: float) -> Sample:
@@ -120,9 +120,14 @@ def _quaternion_of(angle: float) -> Sample:
 
 
 @cell(
-    "rotations", "matrix_to_quaternion", "half turns about special axes", "axis",
-    ("x", "y", "z", "xy", "yz", "zx", "xyz"), quick=("x", "xy"), oracle="50 digits (mpmath)",
-)  # fmt: skip
+    "rotations",
+    "matrix_to_quaternion",
+    "half turns about special axes",
+    "axis",
+    ("x", "y", "z", "xy", "yz", "zx", "xyz"),
+    quick=("x", "xy"),
+    oracle="50 digits (mpmath)",
+)
 def _half_turns(axis: str) -> Sample:
     matrix, exact = _rotation(math.pi, np.array([float(name in axis) for name in "xyz"]))
     return _quaternion_sample(matrix, exact)
@@ -151,9 +156,12 @@ def _quaternion_sample(matrix: Tensor, exact: np.ndarray) -> Sample:
 
 
 @_vector_cell(
-    "matrix_to_axis_angle", "identity to half turn", _ANGLES, _QUICK,
+    "matrix_to_axis_angle",
+    "identity to half turn",
+    _ANGLES,
+    _QUICK,
     limits=(Limit(lambda angle: 0 < float(angle) < 1e-9, 1.0, 1e-4, "entries under 6e-8 may round away"),),
-)  # fmt: skip
+)
 def _vector_of(angle: float) -> Sample:
     import mpmath
 
@@ -186,10 +194,14 @@ def _inverse_jacobian(vector: np.ndarray) -> np.ndarray:
 
 
 @cell(
-    "rotations", "matrix_to_quaternion", "matrix far from a rotation", "scale of the matrix [1]",
-    (1.0, 1.001, 1.1, 0.9), oracle="the rotation itself",
+    "rotations",
+    "matrix_to_quaternion",
+    "matrix far from a rotation",
+    "scale of the matrix [1]",
+    (1.0, 1.001, 1.1, 0.9),
+    oracle="the rotation itself",
     limits=(Limit(lambda scale: scale != 1.0, 0.2, 1.0, "not a rotation: the nearest is not looked for"),),
-)  # fmt: skip
+)
 def _scaled(scale: float) -> Sample:
     import mpmath
 
@@ -200,11 +212,15 @@ def _scaled(scale: float) -> Sample:
 
 
 @cell(
-    "rotations", "normalize_quaternion", "norm", "norm [1]",
-    (1.0, 1e-3, 1e-10, 1e-20, 1e-30, 1e-37, 1e-39, 1e-44, 0.0, 1e10, 1e20, 1e30, 3e38), quick=(1.0, 1e-37, 0.0, 3e38),
+    "rotations",
+    "normalize_quaternion",
+    "norm",
+    "norm [1]",
+    (1.0, 1e-3, 1e-10, 1e-20, 1e-30, 1e-37, 1e-39, 1e-44, 0.0, 1e10, 1e20, 1e30, 3e38),
+    quick=(1.0, 1e-37, 0.0, 3e38),
     oracle="50 digits (mpmath)",
     limits=(Limit(lambda norm: 0 < float(norm) < 1.2e-38, 2.0, 1.001, "subnormal: taken for zero, the identity"),),
-)  # fmt: skip
+)
 def _normalise(norm: float) -> Sample:
     import mpmath
 
@@ -232,10 +248,14 @@ def _normalise(norm: float) -> Sample:
 
 
 @cell(
-    "rotations", "quaternion_multiply", "length of a product of many", "factors [1]", (1.0, 10.0, 1e3, 1e5),
+    "rotations",
+    "quaternion_multiply",
+    "length of a product of many",
+    "factors [1]",
+    (1.0, 10.0, 1e3, 1e5),
     oracle="50 digits (mpmath)",
     limits=(Limit(lambda count: float(count) >= 1e3, 1e-2, 1e-4, "rounding adds up; normalise now and then"),),
-)  # fmt: skip
+)
 def _product(count: float) -> Sample:
     """The rotation by `count` small turns about one axis."""
     import mpmath
@@ -255,9 +275,15 @@ def _product(count: float) -> Sample:
 
 
 @cell(
-    "rotations", "matrix_to_axis_angle", "not a number", "case", ("NaN", "zero matrix"), oracle="nothing finite",
-    refuses=lambda case: case == "NaN", limits=(Limit(lambda case: True, 10.0, 1.0, "no rotation: any rotation"),),
-)  # fmt: skip
+    "rotations",
+    "matrix_to_axis_angle",
+    "not a number",
+    "case",
+    ("NaN", "zero matrix"),
+    oracle="nothing finite",
+    refuses=lambda case: case == "NaN",
+    limits=(Limit(lambda case: True, 10.0, 1.0, "no rotation: any rotation"),),
+)
 def _nonsense(case: Level) -> Sample | Refusal:
     matrix = torch.full((3, 3), math.nan) if case == "NaN" else torch.zeros(3, 3)
     found = matrix_to_axis_angle(matrix)

@@ -4,6 +4,7 @@ Pixels at which rounding of 1e-5 may flip a decision (skip, stop) are left out, 
 """
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,8 +35,15 @@ def _gaussians(count: int, *, depth: float = 1.0, size: float = 0.08, seed: int 
     return [means, quats, size * depth * (0.3 + uniform(count, 3)), 0.2 + 0.7 * uniform(count), uniform(count, 3)]
 
 
-def _compare(tensors: list[Tensor], *, K: Tensor | None = None, view: Tensor | None = None, size: int = _SIZE,
-             every_pixel: bool = False, **options: float) -> Sample:  # fmt: skip
+def _compare(
+    tensors: list[Tensor],
+    *,
+    K: Tensor | None = None,
+    view: Tensor | None = None,
+    size: int = _SIZE,
+    every_pixel: bool = False,
+    **options: float,
+) -> Sample:
     K = camera(20.0, size / 2, size / 2) if K is None else K
     view = torch.eye(4, dtype=torch.float64) if view is None else view
     wide = [tensor.double() for tensor in tensors]
@@ -68,8 +76,8 @@ def _compare(tensors: list[Tensor], *, K: Tensor | None = None, view: Tensor | N
     return Sample(relative(images["cpu"], images["reference"], least=1e-6), gradient)
 
 
-def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: object):
-    return cell("splat", "cpu float32", condition, axis, levels, oracle=_ORACLE, **more)  # type: ignore[arg-type]
+def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
+    return cell("splat", "cpu float32", condition, axis, levels, oracle=_ORACLE, **more)
 
 
 @_cell("flatness", "least scale / largest scale [1]", (1.0, 1e-2, 1e-4, 1e-8, 0.0))
@@ -190,9 +198,16 @@ def _harmonics(size: float) -> Sample:
     return _compare(tensors)
 
 
-@cell("splat", "arguments", "what has no image", "case",
-      ("NaN mean", "negative scale", "infinite scale", "zero quaternion", "opacity 2", "NaN colour", "NaN camera"),
-      quick=("NaN mean",), oracle="a one-line refusal", refuses=lambda case: True)  # fmt: skip
+@cell(
+    "splat",
+    "arguments",
+    "what has no image",
+    "case",
+    ("NaN mean", "negative scale", "infinite scale", "zero quaternion", "opacity 2", "NaN colour", "NaN camera"),
+    quick=("NaN mean",),
+    oracle="a one-line refusal",
+    refuses=lambda case: True,
+)
 def _refused(case: Level) -> Sample:
     tensors, view = _gaussians(3), torch.eye(4)
     if case == "NaN mean":

@@ -1,5 +1,7 @@
 """Cells of the triangulation, float64: exact pixels of known points, then what robust estimation is for."""
 
+from typing import Any
+
 import numpy as np
 
 from nbavatar.extremes.cells import Level, Limit, Refusal, Sample, Tolerance, cell
@@ -38,8 +40,14 @@ def _pixels(points: np.ndarray, K: np.ndarray, views: np.ndarray) -> np.ndarray:
     return image[..., :2] / image[..., 2:]
 
 
-def _error(points: np.ndarray, pixels: np.ndarray, confidence: np.ndarray, K: np.ndarray, views: np.ndarray,
-           distance: float = 2.0) -> Sample | Refusal:  # fmt: skip
+def _error(
+    points: np.ndarray,
+    pixels: np.ndarray,
+    confidence: np.ndarray,
+    K: np.ndarray,
+    views: np.ndarray,
+    distance: float = 2.0,
+) -> Sample | Refusal:
     """Largest error of a point, in units of the cameras' distance; a refusal where no point is given at all."""
     found = triangulate(pixels, confidence, K, views, threshold=_THRESHOLD)
     missing = np.isnan(found.points).any(-1)
@@ -50,13 +58,27 @@ def _error(points: np.ndarray, pixels: np.ndarray, confidence: np.ndarray, K: np
     return Sample(float(np.linalg.norm(found.points - points, axis=1).max()) / distance)
 
 
-def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: object):
-    return cell("triangulation", "triangulate float64", condition, axis, levels, oracle="the points themselves",
-                exact=_EXACT, unit="error / distance", **more)  # type: ignore[arg-type] # fmt: skip
+def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
+    return cell(
+        "triangulation",
+        "triangulate float64",
+        condition,
+        axis,
+        levels,
+        oracle="the points themselves",
+        exact=_EXACT,
+        unit="error / distance",
+        **more,
+    )
 
 
-@_cell("missing views of 8", "views left [1]", (8.0, 4.0, 3.0, 2.0, 1.0, 0.0), quick=(8.0, 2.0, 1.0),
-       refuses=lambda left: float(left) < 2)  # fmt: skip
+@_cell(
+    "missing views of 8",
+    "views left [1]",
+    (8.0, 4.0, 3.0, 2.0, 1.0, 0.0),
+    quick=(8.0, 2.0, 1.0),
+    refuses=lambda left: float(left) < 2,
+)
 def _missing(left: float) -> Sample | Refusal:
     K, views = rig(8)
     points = _points()
@@ -72,8 +94,11 @@ def _missing(left: float) -> Sample | Refusal:
 
 
 @_cell(
-    "outliers among 8 views", "share of outliers [1]", (0.0, 0.25, 0.5, 0.625, 0.75), quick=(0.0, 0.5),
-)  # fmt: skip
+    "outliers among 8 views",
+    "share of outliers [1]",
+    (0.0, 0.25, 0.5, 0.625, 0.75),
+    quick=(0.0, 0.5),
+)
 def _outliers(share: float) -> Sample | Refusal:
     K, views = rig(8)
     points = _points()
@@ -86,10 +111,19 @@ def _outliers(share: float) -> Sample | Refusal:
 
 
 @cell(
-    "triangulation", "triangulate float64", "no two right views of 8", "right views [1]", (1.0, 0.0), quick=(0.0,),
-    oracle="no point", unit="share of wrong points", exact=Tolerance(0.0, 0.0),
-    limits=(Limit(lambda right: True, 0.5, 0.0, "two wrong views that agree by chance cannot be told from right ones"),),
-)  # fmt: skip
+    "triangulation",
+    "triangulate float64",
+    "no two right views of 8",
+    "right views [1]",
+    (1.0, 0.0),
+    quick=(0.0,),
+    oracle="no point",
+    unit="share of wrong points",
+    exact=Tolerance(0.0, 0.0),
+    limits=(
+        Limit(lambda right: True, 0.5, 0.0, "two wrong views that agree by chance cannot be told from right ones"),
+    ),
+)
 def _hopeless(right: float) -> Sample:
     K, views = rig(8)
     points = _points(200)
@@ -101,17 +135,23 @@ def _hopeless(right: float) -> Sample:
 
 
 @_cell(
-    "two cameras only", "angle between the rays [deg]", (90.0, 10.0, 1.0, 0.2, 0.01, 1e-4, 1e-6, 0.0),
+    "two cameras only",
+    "angle between the rays [deg]",
+    (90.0, 10.0, 1.0, 0.2, 0.01, 1e-4, 1e-6, 0.0),
     refuses=lambda angle: float(angle) <= 0.01,
-)  # fmt: skip
+)
 def _two(angle: float) -> Sample | Refusal:
     K, views = rig(2, spread=2 * np.radians(angle))
     points = _points()
     return _error(points, _pixels(points, K, views), np.ones((2, len(points))), K, views)
 
 
-@_cell("two cameras face to face", "points off their line [m]", (0.1, 1e-2, 1e-4, 1e-6, 0.0),
-       refuses=lambda off: float(off) <= 1e-4)  # fmt: skip
+@_cell(
+    "two cameras face to face",
+    "points off their line [m]",
+    (0.1, 1e-2, 1e-4, 1e-6, 0.0),
+    refuses=lambda off: float(off) <= 1e-4,
+)
 def _facing(off: float) -> Sample | Refusal:
     """Points between two cameras that look at each other, beside the line that joins them."""
     K, views = rig(2)
@@ -133,9 +173,12 @@ def _distance(distance: float) -> Sample | Refusal:
 
 
 @_cell(
-    "world far from its origin", "offset [m]", (0.0, 1.0, 1e2, 1e4, 1e6), quick=(0.0, 1e4),
+    "world far from its origin",
+    "offset [m]",
+    (0.0, 1.0, 1e2, 1e4, 1e6),
+    quick=(0.0, 1e4),
     limits=(Limit(lambda offset: float(offset) >= 1e6, 1e-4, 1.0, "K (R x + t) is right to 1e-16 of the offset"),),
-)  # fmt: skip
+)
 def _offset(offset: float) -> Sample | Refusal:
     K, views = rig(8)
     place = offset * np.array([1.0, -0.7, 0.4])
@@ -146,9 +189,12 @@ def _offset(offset: float) -> Sample | Refusal:
 
 
 @_cell(
-    "noise of the pixels", "standard deviation [px]", (0.0, 1e-3, 0.1, 1.0), quick=(0.0, 1.0),
+    "noise of the pixels",
+    "standard deviation [px]",
+    (0.0, 1e-3, 0.1, 1.0),
+    quick=(0.0, 1.0),
     limits=(Limit(lambda noise: float(noise) > 0, 3e-3, 1.0, "in proportion to the noise"),),
-)  # fmt: skip
+)
 def _noise(noise: float) -> Sample | Refusal:
     K, views = rig(8)
     points = _points()
@@ -157,10 +203,21 @@ def _noise(noise: float) -> Sample | Refusal:
 
 
 @_cell(
-    "odd detections in one view of 8", "case",
-    ("NaN pixels", "infinite pixels", "pixels of 1e30", "confidence 0", "confidence NaN", "confidence negative",
-     "confidence 1e30", "confidence 1e-30", "seen from behind", "point on the camera"),
-)  # fmt: skip
+    "odd detections in one view of 8",
+    "case",
+    (
+        "NaN pixels",
+        "infinite pixels",
+        "pixels of 1e30",
+        "confidence 0",
+        "confidence NaN",
+        "confidence negative",
+        "confidence 1e30",
+        "confidence 1e-30",
+        "seen from behind",
+        "point on the camera",
+    ),
+)
 def _odd(case: str) -> Sample | Refusal:
     K, views = rig(8)
     points = _points()

@@ -90,12 +90,21 @@ def measure(cell: Cell, level: Level) -> Row:
     limit = cell.limit(level)
     sample = outcome if isinstance(outcome, Sample) else None
     return Row(
-        cell.family, cell.kernel, cell.condition, cell.axis, level, cell.oracle, cell.unit, verdict,
-        _finite(sample.forward if sample else None), _finite(sample.gradient if sample else None),
+        cell.family,
+        cell.kernel,
+        cell.condition,
+        cell.axis,
+        level,
+        cell.oracle,
+        cell.unit,
+        verdict,
+        _finite(sample.forward if sample else None),
+        _finite(sample.gradient if sample else None),
         max(cell.exact.forward, limit.forward if limit else 0.0),
         max(cell.exact.gradient, limit.gradient if limit else 0.0),
-        message, seconds,
-    )  # fmt: skip
+        message,
+        seconds,
+    )
 
 
 def worst(rows: Sequence[Row]) -> str:

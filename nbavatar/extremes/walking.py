@@ -1,6 +1,7 @@
 """Cells of walking on triangles, float64: the straight line on flat patches, the unfolded one over ridges."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -32,8 +33,16 @@ def _grid(cells: int, *, squeeze: float = 1.0, ridge: float = 0.0) -> tuple[np.n
     return verts, np.concatenate((first, second)), plane
 
 
-def _walk(cells: int, length: float, *, size: float = 1.0, offset: float = 0.0, squeeze: float = 1.0,
-          ridge: float = 0.0, angles: np.ndarray | None = None) -> Sample:  # fmt: skip
+def _walk(
+    cells: int,
+    length: float,
+    *,
+    size: float = 1.0,
+    offset: float = 0.0,
+    squeeze: float = 1.0,
+    ridge: float = 0.0,
+    angles: np.ndarray | None = None,
+) -> Sample:
     """Paths from the middles of some faces to points of the plane; error of the ends, in units of the side."""
     verts, faces, plane = _grid(cells, squeeze=squeeze, ridge=ridge)
     surface = make_surface(verts * size + offset * np.array([1.0, -0.7, 0.4]), faces)
@@ -54,10 +63,10 @@ def _walk(cells: int, length: float, *, size: float = 1.0, offset: float = 0.0, 
     return Sample(float(np.linalg.norm(ends - goal, axis=1).max()))
 
 
-def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: object):
+def _cell(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):
     more.setdefault("oracle", _LINE)
     more.setdefault("exact", _EXACT)
-    return cell("walking", "walk", condition, axis, levels, unit="of the side", **more)  # type: ignore[arg-type]
+    return cell("walking", "walk", condition, axis, levels, unit="of the side", **more)
 
 
 @_cell("triangles crossed", "cells a side [1]", (4.0, 1.0, 16.0, 64.0, 200.0), quick=(4.0, 16.0))
@@ -75,8 +84,12 @@ def _size(size: float) -> Sample:
     return _walk(4, 0.3, size=size)
 
 
-@_cell("mesh far from the origin", "offset / side [1]", (0.0, 1e2, 1e4, 1e6),
-       limits=(Limit(lambda offset: float(offset) >= 1e6, 1e-8, 1.0, "the positions themselves are rounded"),))  # fmt: skip
+@_cell(
+    "mesh far from the origin",
+    "offset / side [1]",
+    (0.0, 1e2, 1e4, 1e6),
+    limits=(Limit(lambda offset: float(offset) >= 1e6, 1e-8, 1.0, "the positions themselves are rounded"),),
+)
 def _offset(offset: float) -> Sample:
     return _walk(7, 0.3, offset=offset)
 
@@ -86,8 +99,12 @@ def _fold(angle: float) -> Sample:
     return _walk(4, 0.45, ridge=math.radians(angle))
 
 
-@_cell("slivers in the way", "height / width [1]", (1.0, 1e-2, 1e-4, 1e-8, 1e-11),
-       limits=(Limit(lambda height: float(height) <= 1e-8, 1e-3, 1.0, "angles of a needle have few digits"),))  # fmt: skip
+@_cell(
+    "slivers in the way",
+    "height / width [1]",
+    (1.0, 1e-2, 1e-4, 1e-8, 1e-11),
+    limits=(Limit(lambda height: float(height) <= 1e-8, 1e-3, 1.0, "angles of a needle have few digits"),),
+)
 def _slivers(height: float) -> Sample:
     return _walk(4, 0.3, squeeze=height, angles=np.array([0.7, -0.9, 1.2]))
 
@@ -119,8 +136,12 @@ def _border(length: float) -> Sample:
     return Sample(float(np.abs(1 - ends.max(1)).max()))
 
 
-@_cell("degenerate mesh", "case", ("a face of no area beside", "a face in one point", "book of three pages", "one face"),
-       oracle="finite; on the mesh; as long as the way is")  # fmt: skip
+@_cell(
+    "degenerate mesh",
+    "case",
+    ("a face of no area beside", "a face in one point", "book of three pages", "one face"),
+    oracle="finite; on the mesh; as long as the way is",
+)
 def _degenerate(case: str) -> Sample:
     verts, faces, _ = _grid(2)
     if case == "a face of no area beside":
