@@ -65,6 +65,8 @@ def sign_distances(points, verts, faces, across, around_start, around, place_of,
         place_of: position in `faces` of each face id that `face` (P,) may name; `weight` (P, 3) barycentric.
     """
     normal = np.zeros(3)
+    # A literal as an argument would be compiled as a type of its own.
+    whole = np.int64(-1)
     for i in range(len(points)):
         if face[i] < 0:
             continue
@@ -75,11 +77,11 @@ def sign_distances(points, verts, faces, across, around_start, around, place_of,
                 zeros += 1
         normal[:] = 0.0
         if zeros <= 1:
-            _add_normal(verts, faces, f, -1, normal)
+            _add_normal(verts, faces, f, whole, normal)
             if zeros == 1:
                 edge = 0 if weight[i, 2] <= 1e-9 else (1 if weight[i, 0] <= 1e-9 else 2)
                 if across[f, edge] >= 0:
-                    _add_normal(verts, faces, across[f, edge], -1, normal)
+                    _add_normal(verts, faces, across[f, edge], whole, normal)
         else:
             c = 0 if weight[i, 0] > 0.5 else (1 if weight[i, 1] > 0.5 else 2)
             v = faces[f, c]

@@ -112,7 +112,8 @@ def separated(verts, faces, nodes, bounds, other_verts, other_faces, other_nodes
     limit = distance * distance
     pairs = np.zeros((_PAIRS, 2), np.int64)
     one, two = np.zeros((1, 6)), np.zeros((1, 6))
-    pairs[0, 0] = pairs[0, 1] = 0
+    # A literal 0 as an argument would be compiled as a type of its own.
+    only = np.int64(0)
     top = 1
     while top > 0:
         top -= 1
@@ -122,11 +123,11 @@ def separated(verts, faces, nodes, bounds, other_verts, other_faces, other_nodes
         if nodes[i, 2] < 0 and other_nodes[j, 2] < 0:
             for f in range(nodes[i, 0], nodes[i, 0] + nodes[i, 1]):
                 _box_of(verts, faces, f, one)
-                if _between(one, 0, other_bounds, j) > limit:
+                if _between(one, only, other_bounds, j) > limit:
                     continue
                 for g in range(other_nodes[j, 0], other_nodes[j, 0] + other_nodes[j, 1]):
                     _box_of(other_verts, other_faces, g, two)
-                    if _between(one, 0, two, 0) <= limit:
+                    if _between(one, only, two, only) <= limit:
                         return False
         elif other_nodes[j, 2] < 0 or (nodes[i, 2] >= 0 and nodes[i, 1] >= other_nodes[j, 1]):
             pairs[top, 0], pairs[top, 1] = nodes[i, 2], j
@@ -213,7 +214,8 @@ def nearest(points, verts, faces, ids, true_faces, nodes, bounds, radius):
     for i in range(count):
         p = points[i]
         best = radius * radius
-        stack[0], reach[0] = 0, _box_distance(bounds, 0, p[0], p[1], p[2])
+        stack[0] = 0
+        reach[0] = _box_distance(bounds, stack[0], p[0], p[1], p[2])
         top = 1
         while top > 0:
             top -= 1
