@@ -31,6 +31,8 @@ from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
 
+_PRUNE_VIEWS = 200  # a billboard shows for many frames, so a sample of the views finds it
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options of `nbavatar train`."""
@@ -104,11 +106,12 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     if folder.moved_to is not None:
         print(f"an earlier state belongs to other inputs, options or code; moved to {folder.moved_to}", file=sys.stderr)
     bar, stop = _Bar(Path(args.out).name), _TerminationFlag()
+    meshes = {part: torch.from_numpy(sequence.parts[part].verts) for part in avatar.parts}
     summary = train(
         method,
         ViewStore(packs, views, avatar.parts, config.cache_mb * 1_000_000),
         len(views),
-        {part: torch.from_numpy(sequence.parts[part].verts) for part in avatar.parts},
+        meshes,
         lpips,
         config,
         folder,
@@ -118,6 +121,11 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     )
     bar.close()
     if summary["finished"]:
+        if config.prune_margin is not None and config.method == "billboards":
+            from nbavatar.tradeoff.prune import prune
+
+            avatar = prune(avatar, meshes, views, margin=config.prune_margin, most_views=_PRUNE_VIEWS)
+            summary["primitives"] = avatar.primitives
         summary |= {"train_seconds": summary["seconds"], "peak_memory_mb": round(peak_memory_mb(device), 1)}
         avatar.record = {**record, "summary": summary, "threads": torch.get_num_threads()}
         if args.history:

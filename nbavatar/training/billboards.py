@@ -11,10 +11,12 @@ from nbavatar.avatar.model import Anchor, Avatar
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
+from nbavatar.training.adam import Adam
 from nbavatar.training.method import Method, StepLoss
 from nbavatar.training.objective import step_loss
 from nbavatar.training.schedule import Plan
 from nbavatar.training.setup import initial_avatar, neighbour_graph
+from nbavatar.training.shape import SmoothOffsets
 
 __all__ = ["BillboardTraining", "parameter_groups"]
 
@@ -24,13 +26,16 @@ class BillboardTraining(Method):
 
     Attributes:
         neighbours: of every billboard, int64 (F, K), or None when the term is off.
+        offsets: smooth fields that move the billboards too, or None.
     """
 
     avatar: Avatar
 
-    def __init__(self, avatar: Avatar, neighbours: Tensor | None, config: TrainConfig) -> None:
+    def __init__(
+        self, avatar: Avatar, neighbours: Tensor | None, config: TrainConfig, offsets: SmoothOffsets | None = None
+    ) -> None:
         super().__init__(avatar, config)
-        self.neighbours = neighbours
+        self.neighbours, self.offsets = neighbours, offsets
 
     @classmethod
     def create(
@@ -45,7 +50,8 @@ class BillboardTraining(Method):
         frames = [sequence.frames[row] for row in sorted({view.row for view in views})]
         avatar = initial_avatar(sequence, coords, frames, config).to(device)
         neighbours = neighbour_graph(avatar, sequence, config)
-        return cls(avatar, None if neighbours is None else neighbours.to(device), config)
+        offsets = SmoothOffsets(avatar, sequence, coords) if config.rates.offset > 0 else None
+        return cls(avatar, None if neighbours is None else neighbours.to(device), config, offsets)
 
     def lpips_net(self) -> str | None:
         """See `Method.lpips_net`."""
@@ -53,7 +59,12 @@ class BillboardTraining(Method):
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """See `Method.parameter_groups`."""
-        return parameter_groups(self.avatar, self.config)
+        groups = parameter_groups(self.avatar, self.config)
+        if self.offsets is not None:
+            rates = self.config.rates
+            field = {"name": "offset", "params": [self.offsets.coefficients], "final": rates.position_final}
+            groups.append({**field, "lr": rates.offset * self.config.rate_factor})
+        return groups
 
     def step_loss(
         self,
@@ -65,6 +76,11 @@ class BillboardTraining(Method):
     ) -> StepLoss:
         """See `Method.step_loss`."""
         return StepLoss(*step_loss(self.avatar, sample, anchor, self.neighbours, lpips, plan, self.config, random))
+
+    def after_step(self, optimizer: Adam, aux: Any, step: int, progress: float, random: torch.Generator) -> None:
+        """See `Method.after_step`."""
+        if self.offsets is not None:
+            self.offsets.apply()
 
 
 def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]]:

@@ -180,6 +180,43 @@ def test_one_frame_and_a_frame_without_hand(tmp_path) -> None:
     assert run(single, CONFIG, tmp_path / "b")[1]["skipped"] == 0
 
 
+def test_a_frame_without_a_head_trains(tmp_path) -> None:
+    whole = sequence()
+    head = whole.parts["head"]
+    verts = head.verts.copy()
+    verts[1] = np.nan
+    scene = write_scene(
+        tmp_path / "lost",
+        meshes=MeshSequence(whole.frames, {**whole.parts, "head": Part(head.faces, head.rest, verts)}, {}),
+    )
+    avatar, summary = run(scene, CONFIG, tmp_path / "state")
+    assert summary["skipped"] == 0
+    assert all(torch.isfinite(p).all() for p in avatar.parameters())
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_faces_train(tmp_path) -> None:
+    whole = sequence()
+    fine = MeshSequence(whole.frames, {"head": _sphere(224, 224, len(whole.frames))}, {})
+    assert len(fine.parts["head"].faces) >= 100_000
+    scene = write_scene(tmp_path / "fine", meshes=fine)
+    _, summary = run(scene, replace(CONFIG, steps=4, texels=2), tmp_path / "state")
+    assert summary["skipped"] == 0 and summary["primitives"] == len(fine.parts["head"].faces)
+
+
+def _sphere(rings: int, columns: int, frames: int) -> Part:
+    """A sphere of 15 cm with 2 * rings * columns faces (slivers at the poles), at rest."""
+    polar, around = np.meshgrid(
+        np.linspace(0.01, np.pi - 0.01, rings + 1), np.linspace(0, 2 * np.pi, columns, endpoint=False), indexing="ij"
+    )
+    points = 0.15 * np.stack([np.sin(polar) * np.cos(around), np.cos(polar), np.sin(polar) * np.sin(around)], -1)
+    index = np.arange((rings + 1) * columns).reshape(rings + 1, columns)
+    a, b, c, d = index[:-1], np.roll(index, -1, 1)[:-1], index[1:], np.roll(index, -1, 1)[1:]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
+    rest = points.reshape(-1, 3).astype(np.float32)
+    return Part(faces.astype(np.int64), rest, np.repeat(rest[None], frames, 0))
+
+
 def test_time_budget_ends_the_training(scene, tmp_path) -> None:
     began = time.monotonic()
     _, summary = run(scene, replace(CONFIG, max_minutes=0.02), tmp_path)
