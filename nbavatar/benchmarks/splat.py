@@ -14,15 +14,17 @@ process's largest memory; `compile_s` the time until the kernels were ready.
 """
 
 import argparse
+import statistics
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nbavatar.benchmarks.raster import _device_name, _median_ms, _peak_mb
 from nbavatar.benchmarks.raster_scene import make_scene
+from nbavatar.devices import device_name, peak_memory_mb
 from nbavatar.errors import DataError
 from nbavatar.raster.ordering import canonical_rank
 from nbavatar.splat import render_gaussians
@@ -79,7 +81,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     if not args.no_reference:
         figures |= _compare(scene)
     return figures | {
-        "threads": torch.get_num_threads(), "device": _device_name("cpu"), "gaussians": args.gaussians,
+        "threads": torch.get_num_threads(), "device": device_name("cpu"), "gaussians": args.gaussians,
         "degree": args.degree, "size": args.size,
     }  # fmt: skip
 
@@ -94,22 +96,34 @@ def _make_scene(size: int, count: int, degree: int) -> _Scene:
     return _Scene((base.means, base.quats, scales, opacities, colours), base.viewmat, base.K, size)
 
 
+def _median_ms(action: Callable[[], Any], repeats: int) -> tuple[float, float]:
+    """Medians of wall time and of processor time, summed over threads, after one run that warms up."""
+    wall, processor = [], []
+    for number in range(repeats + 1):
+        start, start_processor = time.perf_counter(), time.process_time()
+        action()
+        if number:
+            wall.append(1e3 * (time.perf_counter() - start))
+            processor.append(1e3 * (time.process_time() - start_processor))
+    return statistics.median(wall), statistics.median(processor)
+
+
 def _leaves(scene: _Scene, dtype: torch.dtype) -> list[Tensor]:
     return [tensor.detach().to(dtype, copy=True).requires_grad_() for tensor in scene.gaussians]
 
 
 def _measure(scene: _Scene, repeats: int) -> dict[str, Any]:
     """Times of the forward and the backward pass, and what they blend and take."""
-    before = _peak_mb()
+    before = peak_memory_mb("cpu")
     with torch.no_grad():
-        forward, forward_cpu = _median_ms(lambda: scene.render(scene.gaussians, "auto"), repeats, "cpu")
+        forward, forward_cpu = _median_ms(lambda: scene.render(scene.gaussians, "auto"), repeats)
     leaves = _leaves(scene, torch.float32)
     outputs = scene.render(leaves, "auto")
     grads = [torch.randn(output.shape, generator=torch.Generator().manual_seed(0)) for output in outputs]
     backward, backward_cpu = _median_ms(
-        lambda: torch.autograd.grad(outputs, leaves, grads, retain_graph=True), max(3, repeats // 2), "cpu"
+        lambda: torch.autograd.grad(outputs, leaves, grads, retain_graph=True), max(3, repeats // 2)
     )
-    peak = _peak_mb() - before
+    peak = peak_memory_mb("cpu") - before
     means, quats, scales, opacities, colours = scene.gaussians
     settings = SplatSettings(scene.size, scene.size, **_OPTIONS)
     with torch.no_grad():
@@ -119,11 +133,9 @@ def _measure(scene: _Scene, repeats: int) -> dict[str, Any]:
     rank = canonical_rank(projection.depth, means, quats, scales, colours, opacities)
     plain = colours[:, 0].abs().requires_grad_()
     with torch.no_grad():
-        blend, _ = _median_ms(lambda: blend_cpu(projection, rank, opacities, plain, settings), repeats, "cpu")
+        blend, _ = _median_ms(lambda: blend_cpu(projection, rank, opacities, plain, settings), repeats)
     blended = blend_cpu(projection, rank, opacities, plain, settings)
-    behind, _ = _median_ms(
-        lambda: torch.autograd.grad(blended, plain, grads, retain_graph=True), max(3, repeats // 2), "cpu"
-    )
+    behind, _ = _median_ms(lambda: torch.autograd.grad(blended, plain, grads, retain_graph=True), max(3, repeats // 2))
     samples = count_samples(projection, rank, opacities, plain, settings)
     return {
         "forward_ms": forward, "backward_ms": backward, "forward_cpu_ms": forward_cpu,
