@@ -204,7 +204,7 @@ def blend_tiles(turn, tiles, start, members_, record_, box, place_, features_, a
                         ids = spread(np.int32(groups * LANES)) + lane_numbers()
                         groups += 1
                         waiting += count_bits(word)
-                        for lane in (0, LANES - 1):  # and its features, before it is their turn
+                        for lane in (0, LANES // 2, LANES - 1):  # and its features, before it is their turn
                             at = get(k.texel, groups * LANES - LANES + lane) + coming
                             prefetch(scene.features, at)
                             prefetch(scene.features, at + below)

@@ -33,9 +33,12 @@ from nbavatar.raster.lanes import (
     store_where,
     total,
 )  # fmt: skip
-from nbavatar.raster.memory import ahead, fetch_add, get, pointer, put
+from nbavatar.raster.memory import ahead, fetch_add, get, pointer, prefetch, put
 
 __all__ = ["gather_gradients", "scratch_size"]
+
+_AHEAD = 8192  # numbers of the next billboard's textures that are asked for in advance
+_NOTES = 8  # groups of the next tile's notes likewise
 
 
 def scratch_size(texels: int, channels: int) -> int:
@@ -119,7 +122,9 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
         real: scratch of this worker; see `scratch_size`.
     """
     texels, channels, width = shape[0], shape[1], shape[2]
-    limits, record = pointer(limits_, 0), pointer(record_, 0)
+    limits, record, features, alpha = (
+        pointer(limits_, 0), pointer(record_, 0), pointer(features_, 0), pointer(alpha_, 0),
+    )  # fmt: skip
     ranges, notes, spots, grads = pointer(ranges_, 0), pointer(notes_, 0), pointer(spots_, 0), pointer(grads_, 0)
     common = read_limits(limits)
     zero, step, none = get(limits, 0), min(1, texels - 1), common.zero
@@ -143,10 +148,21 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
             s_x, s_y, s_1, t_x, t_y, t_1, w_x, w_y, w_1, g_fade = (
                 none, none, none, none, none, none, none, none, none, none,
             )  # fmt: skip
+            if order + 1 < len(sequence) and first[order + 1] < first[order + 2]:
+                # the next billboard's texture comes while this one is worked on
+                following = np.int64(sequence[order + 1]) * area
+                for j in range(0, min(area * channels, _AHEAD), 64 // alpha_.itemsize):
+                    prefetch(features, following * channels + j)
+                for j in range(0, min(area, _AHEAD), 64 // alpha_.itemsize):
+                    prefetch(alpha, following + j)
             for entry in range(first[order], first[order + 1]):
                 if tile[entry] < first_tile or tile[entry] >= end_tile:
                     continue
                 noted = made[tile[entry]] - base
+                if entry + 1 < first[order + 1]:  # and the notes of the next tile
+                    at = get(ranges, 2 * where[entry + 1]) + made[tile[entry + 1]] - base
+                    for j in range(0, _NOTES * 2 * LANES, 64 // alpha_.itemsize):
+                        prefetch(notes, 2 * LANES * at + j)
                 for band in range(bands):
                     at = 2 * (band * len(where) + where[entry])
                     for group in range(noted + get(ranges, at), noted + get(ranges, at + 1)):
