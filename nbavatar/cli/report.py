@@ -1,6 +1,6 @@
 """One self-contained HTML page: tables, comparison pictures, training curves, provenance.
 
-    --tables     tables (.md, and .csv to download)
+    --tables     tables (.md, and .csv to download); a .csv without its .md is shown as it is
     --evals      results of `nbavatar evaluate` (.json): figures under the pictures, provenance
     --renders    frame packs of `nbavatar render`: render, error map and billboard opacity of chosen frames
     --frames     frame packs of `nbavatar crop`: the truth beside them
@@ -10,7 +10,8 @@
     --pictures   further pictures (.png): of the refit and the contact stage, and results of `nbavatar figure`, whose
                  titles and captions (.json beside them) are shown
     --videos     results of `nbavatar video` (.mp4): played in the page up to `video_mb`, linked beyond
-    --figures    folder for <subject>_<protocol>_<n>.png and .pdf, training.png and .pdf: the same for print
+    --tradeoffs  results of `nbavatar tradeoff` (tradeoff.json), their tables and plots beside them
+    --extremes   result of `nbavatar extremes` (record.json), its table and heat map beside it
     --out        index.html; needs no network and no other file
 
 Every part may be left out; what is not given is not shown.
@@ -18,6 +19,7 @@ Every part may be left out; what is not given is not shown.
 
 import argparse
 import base64
+import csv
 import json
 import os
 from contextlib import ExitStack
@@ -31,7 +33,8 @@ from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.images import decode_image
 from nbavatar.io.records import read_json
-from nbavatar.reporting.comparison import ROWS, Comparison, Rendered, compare_frames, to_strip
+from nbavatar.reporting.comparison import Rendered, compare_frames, to_strip
+from nbavatar.reporting.markdown import markdown_to_html
 from nbavatar.reporting.page import (
     curves_section,
     page,
@@ -42,7 +45,8 @@ from nbavatar.reporting.page import (
     tables_section,
     videos_section,
 )
-from nbavatar.reporting.pictures import ERROR_MAX, data_uri, reduce_picture
+from nbavatar.reporting.pictures import data_uri, reduce_picture
+from nbavatar.tradeoff.section import tradeoff_section
 
 __all__ = ["add_arguments", "main", "read_histories", "read_renders"]
 
@@ -58,12 +62,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("--histories", "JSONL", "training histories"),
         ("--pictures", "PNG", "further pictures"),
         ("--videos", "MP4", "videos"),
+        ("--tradeoffs", "JSON", "sweeps of speed against accuracy"),
+        ("--extremes", "JSON", "kernels at their limits"),
     ):
         parser.add_argument(name, nargs="*", default=[], metavar=kind, help=text)
     parser.add_argument(
         "--size-label", default="", metavar="TEXT", help="why figures are not comparable with the paper"
     )
-    parser.add_argument("--figures", metavar="DIR", help="also write the comparisons as PNG and PDF figures here")
     parser.add_argument("--out", required=True, metavar="HTML", help="page to write")
     add_cfg_argument(parser, ReportConfig)
 
@@ -82,14 +87,14 @@ def main(args: argparse.Namespace) -> int:
         for (subject, protocol), group in comparisons.items()
     }
     histories = read_histories(args.histories)
-    if args.figures:
-        _write_figures(Path(args.figures), comparisons, histories)
     pictures = [(_is_figure(path), _picture(path, cfg)) for path in args.pictures]
     measured = [(Path(path).stem, content) for path, content in speeds]
     sections = [
         ("tables", "Tables", tables_section(_tables(args.tables))),
         ("pictures", "Comparison with the truth", strips_section(strips) if strips else ""),
         ("pareto", "Quality against cost", pareto_section([content for _, content in evals], measured)),
+        ("tradeoff", "Speed against accuracy", "\n".join(_sweep(Path(path), cfg) for path in args.tradeoffs)),
+        ("extremes", "Kernels at their limits", "\n".join(_limits(Path(path), cfg) for path in args.extremes)),
         ("figures", "Figures", pictures_section([picture for figure, picture in pictures if figure])),
         ("videos", "Videos", videos_section([_video(path, args.out, cfg) for path in args.videos])),
         ("training", "Training", _training(args.histories, histories, cfg)),
@@ -107,10 +112,22 @@ def _tables(paths: list[str]) -> dict[str, tuple[str, str]]:
     for name in paths:
         path = Path(name)
         try:
-            texts.setdefault(path.stem, {})[path.suffix] = path.read_text(encoding="utf-8")
+            texts.setdefault(str(path.with_suffix("")), {})[path.suffix] = path.read_text(encoding="utf-8")
         except FileNotFoundError as error:
             raise DataError.of(name, expected="a table (.md or .csv)", found="no such file") from error
-    return {stem: (found.get(".md", ""), found.get(".csv", "")) for stem, found in texts.items()}
+    shown = {}
+    for name, found in texts.items():
+        path, table = Path(name), found.get(".csv", "")
+        title = path.stem if ".md" in found else f"{path.parent.name} {path.stem}"
+        shown[title] = found.get(".md") or _as_markdown(title, table), table
+    return shown
+
+
+def _as_markdown(title: str, table: str) -> str:
+    """A table of numbers without a layout of its own, folded to its csv's columns."""
+    head, *rows = ([cell.replace("|", "\\|") for cell in row] for row in csv.reader(table.splitlines()))
+    lines = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
+    return "\n".join((f"## {title}", "", *lines))
 
 
 def read_renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[Rendered]:
@@ -129,26 +146,6 @@ def read_renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[R
         per_image = figures.get((manifest["subject"], variant, protocol), {})
         found.append(Rendered(manifest["subject"], variant, protocol, background, pack, per_image))
     return found
-
-
-def _write_figures(
-    folder: Path, comparisons: dict[tuple[str, str], list[Comparison]], histories: dict[str, list[dict[str, Any]]]
-) -> None:
-    from nbavatar.reporting.figures import save_figure
-    from nbavatar.reporting.gallery import comparison_rows, curves_drawn
-    from nbavatar.reporting.grids import grid_figure
-
-    figures = {"training": curves_drawn(histories).figure} if histories else {}
-    for (subject, protocol), group in comparisons.items():
-        for number, comparison in enumerate(group):
-            columns = [(column.title, column.title) for column in comparison.columns]
-            rows = comparison_rows(comparison, columns, ROWS)
-            bar = ("|error|, sRGB [1]", ERROR_MAX) if any(row.name == "error" for row in rows) else None
-            figures[f"{subject}_{protocol}_{number}"] = grid_figure([title for title, _ in columns], rows, bar=bar)
-    for name, figure in figures.items():
-        for suffix in ("png", "pdf"):
-            with atomic_write(folder / f"{name}.{suffix}") as path:
-                save_figure(figure, path)
 
 
 def read_histories(paths: list[str]) -> dict[str, list[dict[str, Any]]]:
@@ -184,6 +181,34 @@ def _training(paths: list[str], histories: dict[str, list[dict[str, Any]]], cfg:
     return curves_section(histories) + shown
 
 
+def _sweep(path: Path, cfg: ReportConfig) -> str:
+    section = tradeoff_section(read_json(path), _text(path.with_name("points.md")))
+    named = [(caption, _embedded(path.with_name(name), cfg), caption) for name, caption in section.figures]
+    rows = f"<details><summary>All points</summary>{markdown_to_html(section.table)}</details>"
+    title = " ".join(path.parts[-3:-1])
+    return "\n".join(
+        (markdown_to_html("\n\n".join([f"## {title}", *section.paragraphs])), pictures_section(named), rows)
+    )
+
+
+def _limits(path: Path, cfg: ReportConfig) -> str:
+    text = "Verdicts of all measurements: exact, degraded within a stated bound, or refused with a reason."
+    picture = pictures_section([(text, _embedded(path.with_name("heatmap.png"), cfg), text)])
+    table = markdown_to_html(_text(path.with_name("table.md")).partition("\n")[2])  # the section has its heading
+    return f"{picture}\n<details><summary>All cells</summary>{table}</details>"
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise DataError.of(path, expected="a table (.md)", found="no such file") from error
+
+
+def _embedded(path: Path, cfg: ReportConfig) -> str:
+    return data_uri(reduce_picture(decode_image(path), 3 * cfg.max_side))
+
+
 def _is_figure(name: str) -> bool:
     return Path(name).with_suffix(".json").is_file()
 
@@ -197,8 +222,7 @@ def _picture(name: str, cfg: ReportConfig) -> tuple[str, str, str]:
         said = read_json(path.with_suffix(".json"))
         title = ". ".join(part.rstrip(".") for part in (said.get("title"), said.get("caption")) if part) or path.stem
         text = f"{title}: {', '.join(said.get('shown', [])) or 'nothing yet'}"
-    picture = reduce_picture(decode_image(path), 3 * cfg.max_side)
-    return title, data_uri(picture), text
+    return title, _embedded(path, cfg), text
 
 
 def _video(name: str, page_path: str, cfg: ReportConfig) -> tuple[str, str, bool]:

@@ -111,6 +111,12 @@ def load_run(mapping: Mapping[str, Any], where: str = "config") -> RunConfig:
     ]:
         if crop not in run.crops:
             raise ConfigError(f"{where}.{name}.crop: unknown crop '{crop}'; {did_you_mean(crop, run.crops)}")
+    stages = {field.name for field in dataclasses.fields(Stages)}
+    for name, variant in run.variants.items():
+        for stage in variant.stages:
+            if stage not in stages:
+                raise ConfigError(f"{where}.variants.{name}: unknown stage '{stage}'; {did_you_mean(stage, stages)}")
+            _resolved(run, stage, name)
     for name in (*run.videos, *run.tradeoff.variants):
         if name not in run.variants:
             raise ConfigError(f"{where}: unknown variant '{name}'; {did_you_mean(name, run.variants)}")
@@ -120,12 +126,6 @@ def load_run(mapping: Mapping[str, Any], where: str = "config") -> RunConfig:
     for pair in run.reenact:
         if pair.count("/") != 1:
             raise ConfigError.of(f"{where}.reenact", expected="pairs source/target", found=repr(pair))
-    stages = {field.name for field in dataclasses.fields(Stages)}
-    for name, variant in run.variants.items():
-        for stage in variant.stages:
-            if stage not in stages:
-                raise ConfigError(f"{where}.variants.{name}: unknown stage '{stage}'; {did_you_mean(stage, stages)}")
-            _resolved(run, stage, name)
     return run
 
 

@@ -12,10 +12,19 @@ import pytest
 ROOT = Path(__file__).parents[2]
 # Creates whatever a rule's command is asked to write, and does nothing else.
 STUB = """#!/bin/sh
+verb=$1
+make() { mkdir -p "$(dirname "$1")"; echo made > "$1"; }
 while [ $# -gt 0 ]; do
-  case "$1" in
-    --out|--csv|--sheet|--exr|--picture|--history|--validate) mkdir -p "$(dirname "$2")"; echo made > "$2" ;;
-    --out-stem) mkdir -p "$(dirname "$2")"; for s in csv md tex; do echo made > "$2.$s"; done ;;
+  case "$verb $1" in
+    "tradeoff --out") for f in tradeoff.json points.csv presets.json front_ms.png front_memory.png front_bytes.png
+      do make "$2/$f"; done ;;
+    "extremes --out") for f in table.md table.csv heatmap.png curves.png record.json; do make "$2/$f"; done ;;
+    "video --out") make "$2"; make "$2.json" ;;
+    "tradeoff --sheet") ;;
+    "deform --table") make "$2" ;;
+    *" --out"|*" --csv"|*" --sheet"|*" --exr"|*" --picture"|*" --history"|*" --validate") make "$2" ;;
+    "figure --out-stem") for s in png pdf json; do make "$2.$s"; done ;;
+    *" --out-stem") for s in csv md tex; do make "$2.$s"; done ;;
   esac
   shift
 done

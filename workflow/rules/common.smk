@@ -197,8 +197,12 @@ def meshes_for(subject, variant):
 
 def fitted(wildcards):
     """Meshes before contact: refitted ones, or those that a capture brings."""
+    return fitted_of(wildcards.subject)
+
+
+def fitted_of(subject):
     stage = "tracks" if RUN.layout == "capture" else "fit"
-    return f"{R}/{stage}/{wildcards.subject}.npz"
+    return f"{R}/{stage}/{subject}.npz"
 
 
 def frames_under(protocol, subject):
@@ -264,11 +268,18 @@ def report_pictures():
     )
     if RUN.layout == "capture" and RUN.stages.tracks.contact == "given":
         stages = ("spectral",)
-    return [
+    return [f"{R}/figures/{figure}.png" for figure in FIGURES] + [
         f"{R}/{stage}/{s}.png"
         for stage in stages
         for s in dict.fromkeys(row.subject for row in ROWS)
     ]
+
+
+def contact_tables():
+    """Millimetres of the contact stage, where it is part of the run."""
+    if RUN.layout == "capture" and RUN.stages.tracks.contact == "given":
+        return []
+    return [f"{R}/deform/{s}.csv" for s in dict.fromkeys(row.subject for row in ROWS)]
 
 
 def figure_rows(name):

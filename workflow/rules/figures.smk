@@ -6,12 +6,13 @@ OUTPUTS: results/{run}/figures/{figure}.{png,pdf,json}, results/{run}/reenact/{s
 """
 
 
+# Poses are exchanged between heads without contact; the contact stage then dents the head that is shown.
 rule reenact:
     input:
-        source=lambda w: meshes_for(w.source, "full"),
-        target=lambda w: meshes_for(w.target, "full"),
+        source=lambda w: fitted_of(w.source),
+        target=lambda w: fitted_of(w.target),
     output:
-        "results/{run}/reenact/{source}/{target}.npz",
+        "results/{run}/reenact/{source}/{target}.before.npz",
     log:
         "logs/{run}/reenact/{source}/{target}.log",
     resources:
@@ -27,6 +28,24 @@ rule reenact:
     shell:
         "nbavatar reenact --source {input.source} --target {input.target} {params.assets}"
         " --out {output} > {log} 2>&1"
+
+
+rule reenact_contact:
+    input:
+        "results/{run}/reenact/{source}/{target}.before.npz",
+    output:
+        "results/{run}/reenact/{source}/{target}.npz",
+    log:
+        "logs/{run}/reenact_contact/{source}/{target}.log",
+    threads: 4
+    resources:
+        mem="8GB",
+        runtime="4h",
+    params:
+        cfg=options("deform"),
+        code=code_digest("deform"),
+    shell:
+        "nbavatar deform --meshes {input} --out {output} --cfg {params.cfg:q} > {log} 2>&1"
 
 
 rule video:

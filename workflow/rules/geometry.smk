@@ -72,6 +72,7 @@ rule deform:
     output:
         meshes="results/{run}/deform/{subject}.npz",
         maps="results/{run}/deform/{subject}.exr.zip",
+        table="results/{run}/deform/{subject}.csv",
         picture=report(
             "results/{run}/deform/{subject}.png",
             category="Geometry",
@@ -91,4 +92,5 @@ rule deform:
         code=code_digest("deform"),
     shell:
         "nbavatar deform --meshes {input} --out {output.meshes} --exr {output.maps} --validate {output.picture}"
+        " --table {output.table}"
         " --cfg {params.cfg:q} > {log} 2>&1"

@@ -43,12 +43,16 @@ rule report:
             for table in TABLES
             for suffix in ("md", "csv")
         ],
+        contact=contact_tables(),
         evals=evals_of(ROWS),
         speeds=sorted({path for table in TABLES for path in speeds_of(table)}),
         renders=renders_of(ROWS),
         frames=sorted({path for row in ROWS for path in protocol_frames(row)}),
         histories=[f"{R}/train/{s}/{v}/history.jsonl" for s, v in avatars()],
         pictures=report_pictures(),
+        videos=videos(),
+        tradeoffs=tradeoffs(),
+        extremes=[f"{R}/extremes/record.json"] if RUN.extremes else [],
     output:
         report(
             "results/{run}/report/index.html",
@@ -62,11 +66,11 @@ rule report:
         runtime="30m",
     params:
         label=RUN.size_label,
-        figures=lambda w, output: str(Path(output[0]).parent / "figures"),
         cfg=options("report"),
         code=code_digest("report"),
     shell:
-        "nbavatar report --tables {input.tables} --evals {input.evals} --renders {input.renders}"
+        "nbavatar report --tables {input.tables} {input.contact} --evals {input.evals} --renders {input.renders}"
         " --speeds {input.speeds} --frames {input.frames} --histories {input.histories}"
-        " --pictures {input.pictures} --size-label {params.label:q} --figures {params.figures}"
+        " --pictures {input.pictures} --videos {input.videos} --tradeoffs {input.tradeoffs}"
+        " --extremes {input.extremes} --size-label {params.label:q}"
         " --out {output} --cfg {params.cfg:q} > {log} 2>&1"

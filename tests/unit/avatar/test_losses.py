@@ -5,7 +5,16 @@ import math
 import pytest
 import torch
 
-from nbavatar.avatar.losses import knn_graph, loss_delta, loss_dice, loss_dice_haha, loss_knn, loss_mse
+from nbavatar.avatar.losses import (
+    _nearest,
+    _nearest_of_many,
+    knn_graph,
+    loss_delta,
+    loss_dice,
+    loss_dice_haha,
+    loss_knn,
+    loss_mse,
+)
 
 
 def test_loss_mse_equals_hand_value_and_spreads_over_the_whole_picture() -> None:
@@ -69,6 +78,15 @@ def test_knn_graph_without_self_and_with_tiny_groups() -> None:
     groups = torch.tensor([0, 0, 0, 1])
     graph = knn_graph(points, groups, 2, include_self=False)
     assert graph.tolist() == [[1, 2], [0, 2], [1, 0], [3, 3]]
+
+
+@pytest.mark.parametrize("count", [5, 3000, 5000])
+def test_knn_in_slabs_equals_all_distances(count) -> None:
+    points = torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(count))
+    points[:, 1] *= 3.0
+    points[count // 2 :, 1] += 2.0  # a gap wider than a slab
+    assert torch.equal(_nearest_of_many(points, 4), _nearest(points, 4))
+    assert _nearest_of_many(torch.zeros(3000, 3, dtype=torch.float64), 3)[:, 0].tolist() == list(range(3000))
 
 
 def test_knn_graph_puts_the_point_itself_first_among_coincident_ones() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from nbavatar.cli import main
 from nbavatar.io.framepack import FramePackWriter
-from nbavatar.io.images import decode_image, encode_png
+from nbavatar.io.images import encode_png
 from nbavatar.reporting.comparison import find_truth
 from nbavatar.reporting.curves import line_chart, thin
 from nbavatar.reporting.markdown import markdown_to_html
@@ -149,17 +149,12 @@ def test_every_part_may_be_missing(run):
     Page(build(folder, {}))
 
 
-@pytest.mark.slow
-def test_figures_for_print(run):
-    folder, options = run
-    build(folder, options, "--figures", str(folder / "figures"), "--cfg", '{"frames": 1}')
-    names = sorted(path.name for path in (folder / "figures").iterdir())
-    assert names == ["S2_nv1024_0.pdf", "S2_nv1024_0.png", "training.pdf", "training.png"]
-    first = {path.name: path.read_bytes() for path in (folder / "figures").iterdir()}
-    assert first["S2_nv1024_0.pdf"].startswith(b"%PDF")
-    shown = decode_image(first["S2_nv1024_0.png"])
-    # Three columns and four rows of pictures; a truth, two renders, two error maps.
-    assert shown.shape[0] > 900 and (shown < 250).any(axis=-1).mean() > 0.4
+def test_a_table_of_numbers_is_shown_as_it_is(tmp_path):
+    (tmp_path / "deform").mkdir()
+    (tmp_path / "deform/S2.csv").write_text("group,quantity,value\nbefore,depth_mm,5.9\nafter,depth_mm,0.04\n")
+    text = build(tmp_path, {"--tables": [str(tmp_path / "deform/S2.csv")]})
+    assert "deform S2" in text
+    assert '<th scope="row">after</th><td>depth_mm</td><td>0.04</td>' in text
 
 
 def test_quality_against_cost_figures_and_videos(run):
