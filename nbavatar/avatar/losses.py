@@ -11,6 +11,9 @@ from torch import Tensor
 __all__ = ["knn_graph", "loss_delta", "loss_dice", "loss_dice_haha", "loss_knn", "loss_mse"]
 
 _EPS = 1e-8
+_CHUNK = 2048  # queries at once
+_SLAB = 256  # the same, where their neighbourhood is to be thin
+_MANY = 16384  # above this all distances are too many
 
 
 def loss_mse(image: Tensor, target: Tensor, *, pixels: int | None = None) -> Tensor:
@@ -88,18 +91,52 @@ def knn_graph(points: Tensor, groups: Tensor, neighbours: int, *, include_self: 
         own = points[members].double()
         skip = 0 if include_self else 1
         count = min(neighbours + skip, len(members))
-        rows = []
-        for start in range(0, len(members), 2048):  # bounds the distance matrix
-            query = own[start : start + 2048]
-            distance = torch.cdist(query, own, compute_mode="donot_use_mm_for_euclid_dist")
-            # The point itself comes first even where others coincide with it.
-            distance[torch.arange(len(query)), torch.arange(start, start + len(query))] = -1.0
-            rows.append(distance.topk(count, largest=False, sorted=True).indices)
-        nearest = torch.cat(rows)[:, min(skip, count - 1) :]
+        nearest = (_nearest if len(members) <= _MANY else _nearest_of_many)(own, count)[:, min(skip, count - 1) :]
         if nearest.shape[1] < neighbours:
             nearest = torch.cat((nearest, nearest[:, -1:].expand(-1, neighbours - nearest.shape[1])), dim=1)
         result[members] = members[nearest]
     return result
+
+
+def _nearest(points: Tensor, count: int) -> Tensor:
+    """The `count` nearest of float64 [N, 3] to each of them, the point itself first; int64 [N, count]."""
+    rows = []
+    for start in range(0, len(points), _CHUNK):  # bounds the distance matrix
+        rows.append(_nearest_in(points, start, points[start : start + _CHUNK], count)[0])
+    return torch.cat(rows)
+
+
+def _nearest_of_many(points: Tensor, count: int) -> Tensor:
+    """As `_nearest`, in slabs across the longest axis: what is farther along it than the answer is never looked at."""
+    axis = int((points.amax(0) - points.amin(0)).argmax())
+    order = points[:, axis].argsort(stable=True)
+    ranked = points[order]
+    along = ranked[:, axis].contiguous()
+    result = torch.empty(len(points), count, dtype=torch.int64, device=points.device)
+    reach = 0.0
+    for start in range(0, len(points), _SLAB):
+        query = ranked[start : start + _SLAB]
+        while True:
+            low = min(start, int(torch.searchsorted(along, query[0, axis] - reach)))
+            high = max(start + len(query), int(torch.searchsorted(along, query[-1, axis] + reach, right=True)))
+            low, high = max(0, min(low, high - count)), min(len(points), max(high, low + count))
+            found, distance = _nearest_in(ranked[low:high], start - low, query, count)
+            farthest = float(distance.amax())
+            if farthest <= reach or high - low == len(points):
+                break
+            reach = farthest
+        result[order[start : start + _SLAB]] = order[low + found]
+        reach = farthest
+    return result
+
+
+def _nearest_in(points: Tensor, start: int, query: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Places in `points` of those nearest to queries that stand there from `start` on, and their distances."""
+    distance = torch.cdist(query, points, compute_mode="donot_use_mm_for_euclid_dist")
+    # The point itself comes first even where others coincide with it.
+    distance[torch.arange(len(query)), torch.arange(start, start + len(query))] = -1.0
+    values, places = distance.topk(count, largest=False, sorted=True)
+    return places, values
 
 
 def loss_knn(means: Tensor, quats: Tensor, half_extents: Tensor, neighbours: Tensor) -> Tensor:

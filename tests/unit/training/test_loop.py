@@ -199,8 +199,8 @@ def test_a_hundred_thousand_faces_train(tmp_path) -> None:
     whole = sequence()
     fine = MeshSequence(whole.frames, {"head": _sphere(224, 224, len(whole.frames))}, {})
     assert len(fine.parts["head"].faces) >= 100_000
-    scene = write_scene(tmp_path / "fine", meshes=fine)
-    _, summary = run(scene, replace(CONFIG, steps=4, texels=2), tmp_path / "state")
+    scene = write_scene(tmp_path / "fine", size=128, meshes=fine)
+    _, summary = run(scene, replace(CONFIG, steps=2, texels=2, schedule="paper"), tmp_path / "state")
     assert summary["skipped"] == 0 and summary["primitives"] == len(fine.parts["head"].faces)
 
 
