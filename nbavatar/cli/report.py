@@ -124,10 +124,17 @@ def _tables(paths: list[str]) -> dict[str, tuple[str, str]]:
 
 
 def _as_markdown(title: str, table: str) -> str:
-    """A table of numbers without a layout of its own, folded to its csv's columns."""
-    head, *rows = ([cell.replace("|", "\\|") for cell in row] for row in csv.reader(table.splitlines()))
+    """A table of numbers without a layout of its own, in at most four digits; the csv has all of them."""
+    head, *rows = ([_short(cell).replace("|", "\\|") for cell in row] for row in csv.reader(table.splitlines()))
     lines = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
     return "\n".join((f"## {title}", "", *lines))
+
+
+def _short(cell: str) -> str:
+    try:
+        return f"{float(cell):.4g}" if "." in cell else cell
+    except ValueError:
+        return cell
 
 
 def read_renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[Rendered]:

@@ -55,7 +55,7 @@ def heat_map(rows: Sequence[Row]) -> "Figure":
                 axis.text(column, line, letter, ha="center", va="center", fontsize=5.5)
         axis.imshow(image, aspect="auto", interpolation="nearest")
         axis.set_title(f"error of the {title}", fontsize=9)
-        axis.set_xlabel("level, from harmless to the limit", fontsize=8)
+        axis.set_xlabel("level (1: harmless)", fontsize=8)
         axis.set_xticks(range(widest), [str(i + 1) for i in range(widest)], fontsize=6)
         axis.set_xticks(np.arange(widest + 1) - 0.5, minor=True)
         axis.set_yticks(np.arange(len(groups) + 1) - 0.5, minor=True)

@@ -61,7 +61,7 @@ def tables_section(tables: Mapping[str, tuple[str, str]]) -> str:
         if table:
             address = "data:text/csv;base64," + base64.b64encode(table.encode()).decode("ascii")
             link = f'<a download="{_safe(name)}.csv" href="{address}">{_safe(name)}.csv</a>'
-            body += f"\n<p>{link}: every cell with its source</p>"
+            body += f"\n<p>{link}: all digits, and for the tables of the paper the source of every cell</p>"
         parts.append(f'<section id="table-{_safe(name)}">\n{body}\n</section>')
     return "\n".join(parts)
 
