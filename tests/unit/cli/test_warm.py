@@ -8,6 +8,8 @@ import sys
 _SCRIPT = """
 import json, os, subprocess, sys, time
 
+import psutil
+
 folder = sys.argv[1]
 run = [sys.executable, "-m", "nbavatar"]
 inputs = ["--meshes", "absent.npz", "--frames", "absent.zip", "--out", "out.zip"]
