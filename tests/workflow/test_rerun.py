@@ -85,13 +85,13 @@ def test_nothing_is_done_twice(finished):
 
 def test_an_option_of_evaluation_runs_evaluation_only(edit):
     plan = edit("config/smoke.yaml", _config(stages__evaluate={"foreground_threshold": 0.9}))
-    assert plan == {"evaluate": 12, "table": 6, "report": 1}
+    assert plan == {"evaluate": 18, "table": 7, "figure": 2, "report": 1}  # ablation and pareto show results
 
 
 def test_an_option_of_one_variant_runs_that_variant_only(edit):
     text = {"stages": {"train": {"channels": 4}}}
     plan = edit("config/smoke.yaml", _config(variants__ch03=text))
-    assert plan == {"train": 1, "render": 1, "evaluate": 1, "speed": 1, "table": 1, "report": 1}
+    assert plan == {"train": 1, "render": 1, "evaluate": 1, "speed": 1, "table": 1, "figure": 1, "report": 1}
 
 
 def test_an_option_of_training_retrains_everything_and_rebuilds_no_image(edit):
@@ -136,7 +136,7 @@ def test_a_new_row_of_the_sheet_runs_that_row_only(edit):
 
 def test_an_edit_of_printed_numbers_rebuilds_tables_only(edit):
     plan = edit("config/reported.csv", lambda text: re.sub(r"28\.63", "28.64", text))
-    assert plan == {"table": 7, "report": 1}
+    assert plan == {"table": 8, "report": 1}
 
 
 def test_a_touched_but_unchanged_input_runs_nothing(finished):
