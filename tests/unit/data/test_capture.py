@@ -219,7 +219,5 @@ def test_a_part_that_is_nowhere_is_refused(capture):
         mesh = dict(np.load(capture / f"meshes/t{i}.npz"))
         mesh.pop("right_hand")
         np.savez(capture / f"meshes/t{i}.npz", **mesh)
-    with pytest.raises(
-        DataError, match="right_hand in a frame at least, found it in none; leave right_hand_faces"
-    ):
+    with pytest.raises(DataError, match="right_hand in a frame at least, found it in none; leave right_hand_faces"):
         build_capture_tracks(open_capture(capture), [f"t{i}" for i in range(5)], contact="given")
