@@ -2,10 +2,10 @@
 
 import dataclasses
 import os
-from pathlib import Path
 
-from nbavatar.config.core import from_mapping, option
-from nbavatar.errors import ConfigError, did_you_mean
+from nbavatar.config.core import option
+from nbavatar.config.layouts import choose_layout, read_layouts
+from nbavatar.errors import ConfigError
 
 __all__ = ["FigureColumn", "FigureLayout", "choose_figure", "read_figures"]
 
@@ -59,17 +59,7 @@ def read_figures(path: str | os.PathLike[str]) -> dict[str, FigureLayout]:
     Raises:
         ConfigError: no such file, not YAML, an unknown key, a wrong type.
     """
-    import yaml
-
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError.of(path, expected="the layout of the figures (.yaml)", found="no such file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError.of(path, expected="YAML", found=f"text that does not parse ({error})") from error
-    if not isinstance(content, dict):
-        raise ConfigError.of(path, expected="figure name -> layout", found=type(content).__name__)
-    figures = {str(name): from_mapping(FigureLayout, value, f"{path}: {name}") for name, value in content.items()}
+    figures = read_layouts(path, FigureLayout, "figure")
     for name, figure in figures.items():
         if figure.kind == "comparison" and not (figure.columns and figure.protocol):
             raise ConfigError.of(f"{path}: {name}", expected="columns and a protocol", found="none")
@@ -82,6 +72,4 @@ def choose_figure(figures: dict[str, FigureLayout], name: str, where: str) -> Fi
     Raises:
         ConfigError: there is none of this name.
     """
-    if name not in figures:
-        raise ConfigError(f"{where}: unknown figure '{name}'; {did_you_mean(name, figures)}")
-    return figures[name]
+    return choose_layout(figures, name, where, "figure")

@@ -2,10 +2,10 @@
 
 import dataclasses
 import os
-from pathlib import Path
 
-from nbavatar.config.core import from_mapping, option
-from nbavatar.errors import ConfigError, did_you_mean
+from nbavatar.config.core import option
+from nbavatar.config.layouts import choose_layout, read_layouts
+from nbavatar.errors import ConfigError
 
 __all__ = ["TIMED", "TRAINED", "Panel", "TableLayout", "TableRow", "choose_table", "read_tables"]
 
@@ -89,17 +89,7 @@ def read_tables(path: str | os.PathLike[str]) -> dict[str, TableLayout]:
     Raises:
         ConfigError: no such file, not YAML, an unknown key, a wrong type.
     """
-    import yaml
-
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError.of(path, expected="the layout of the tables (.yaml)", found="no such file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError.of(path, expected="YAML", found=f"text that does not parse ({error})") from error
-    if not isinstance(content, dict):
-        raise ConfigError.of(path, expected="table name -> layout", found=type(content).__name__)
-    tables = {str(name): from_mapping(TableLayout, value, f"{path}: {name}") for name, value in content.items()}
+    tables = read_layouts(path, TableLayout, "table")
     for name, table in tables.items():
         where = f"{path}: {name}"
         if not table.rows or not table.panels or not table.columns:
@@ -115,6 +105,4 @@ def choose_table(tables: dict[str, TableLayout], name: str, where: str) -> Table
     Raises:
         ConfigError: there is none of this name.
     """
-    if name not in tables:
-        raise ConfigError(f"{where}: unknown table '{name}'; {did_you_mean(name, tables)}")
-    return tables[name]
+    return choose_layout(tables, name, where, "table")

@@ -1,0 +1,48 @@
+"""Files that hold named layouts: what config/tables.yaml and config/figures.yaml have in common."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from nbavatar.config.core import from_mapping
+from nbavatar.errors import ConfigError, did_you_mean
+
+__all__ = ["choose_layout", "read_layouts"]
+
+T = TypeVar("T")
+
+
+def read_layouts(path: str | os.PathLike[str], cls: type[T], kind: str) -> dict[str, T]:
+    """Reads a file of named layouts.
+
+    Args:
+        path: a YAML file, name -> layout.
+        cls: dataclass of one layout.
+        kind: what is laid out, for errors: `table`, `figure`.
+
+    Raises:
+        ConfigError: no such file, not YAML, an unknown key, a wrong type.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError.of(path, expected=f"the layout of the {kind}s (.yaml)", found="no such file") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError.of(path, expected="YAML", found=f"text that does not parse ({error})") from error
+    if not isinstance(content, dict):
+        raise ConfigError.of(path, expected=f"{kind} name -> layout", found=type(content).__name__)
+    return {str(name): from_mapping(cls, value, f"{path}: {name}") for name, value in content.items()}
+
+
+def choose_layout(layouts: Mapping[str, T], name: str, where: str, kind: str) -> T:
+    """One layout by its name.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
+    if name not in layouts:
+        raise ConfigError(f"{where}: unknown {kind} '{name}'; {did_you_mean(name, layouts)}")
+    return layouts[name]
