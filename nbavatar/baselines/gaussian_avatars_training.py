@@ -63,19 +63,9 @@ class GaussianAvatarsTraining(GaussianTraining):
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """See `Method.parameter_groups`; the rate of the positions grows with the scene, as published."""
-        avatar, rates, factor = self.avatar, self.options.rates, self.config.rate_factor
-        named = [
-            ("position", rates.position * self.extent, avatar.offset, rates.position_final),
-            ("colour", rates.colour, avatar.colour, 1.0),
-            ("colour_rest", rates.colour_rest, avatar.colour_rest, 1.0),
-            ("opacity", rates.opacity, avatar.opacity_logit, 1.0),
-            ("scale", rates.scale, avatar.log_scale, 1.0),
-            ("rotation", rates.rotation, avatar.quat, 1.0),
-        ]
-        return [
-            {"name": name, "lr": rate * factor, "params": [parameter], "final": final}
-            for name, rate, parameter, final in named
-        ]
+        rates = self.options.rates
+        place = ("position", rates.position * self.extent, self.avatar.offset, rates.position_final)
+        return self.groups_of(place, rates, rates.colour_rest)
 
     def step_loss(
         self,

@@ -78,19 +78,9 @@ class SplattingAvatarTraining(GaussianTraining):
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """See `Method.parameter_groups`."""
-        avatar, rates, factor = self.avatar, self.options.rates, self.config.rate_factor
-        named = [
-            ("embedding", rates.embedding, avatar.uvd, rates.embedding_final),
-            ("colour", rates.colour, avatar.colour, 1.0),
-            ("colour_rest", rates.colour, avatar.colour_rest, 1.0),
-            ("opacity", rates.opacity, avatar.opacity_logit, 1.0),
-            ("scale", rates.scale, avatar.log_scale, 1.0),
-            ("rotation", rates.rotation, avatar.quat, 1.0),
-        ]
-        return [
-            {"name": name, "lr": rate * factor, "params": [parameter], "final": final}
-            for name, rate, parameter, final in named
-        ]
+        rates = self.options.rates
+        place = ("embedding", rates.embedding, self.avatar.uvd, rates.embedding_final)
+        return self.groups_of(place, rates, rates.colour)
 
     def step_loss(
         self,

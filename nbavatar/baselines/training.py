@@ -107,6 +107,30 @@ class GaussianTraining(Method):
         self.calendar = Calendar(iterations, steps, scaled=config.schedule == "fast")
         self.statistics = Statistics(avatar.primitives, avatar.faces.device)
 
+    def groups_of(
+        self, place: tuple[str, float, Tensor, float], rates: Any, colour_rest: float
+    ) -> list[dict[str, Any]]:
+        """Adam groups of a Gaussian avatar.
+
+        Args:
+            place: name, rate, parameter and final factor of what says where the Gaussians are.
+            rates: of `colour`, `opacity`, `scale`, `rotation`.
+            colour_rest: rate of the higher harmonics.
+        """
+        avatar, factor = self.avatar, self.config.rate_factor
+        named = [
+            place,
+            ("colour", rates.colour, avatar.colour, 1.0),
+            ("colour_rest", colour_rest, avatar.colour_rest, 1.0),
+            ("opacity", rates.opacity, avatar.opacity_logit, 1.0),
+            ("scale", rates.scale, avatar.log_scale, 1.0),
+            ("rotation", rates.rotation, avatar.quat, 1.0),
+        ]
+        return [
+            {"name": name, "lr": rate * factor, "params": [parameter], "final": final}
+            for name, rate, parameter, final in named
+        ]
+
     def total_steps(self) -> int:
         """The budget's steps; the published number under `schedule: paper`."""
         if self.config.steps is None and self.config.schedule == "paper":
