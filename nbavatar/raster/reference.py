@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from nbavatar.raster.blocks import pixel_blocks
 from nbavatar.raster.projection import Projection
 
 __all__ = ["BlendSettings", "blend_reference", "critical_pixels"]
 
-_BLOCK = 32  # pixels a side of a block
-_BUDGET = 4_000_000  # largest number of float64 values in one intermediate of a block
+_OWN = 4  # numbers beside its features that a billboard takes at a pixel
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class _Blend(torch.autograd.Function):
         s: BlendSettings = settings
         image = torch.zeros(features.shape[-1], s.height, s.width, dtype=torch.float64, device=plane.device)
         opacity = torch.zeros(s.height, s.width, dtype=torch.float64, device=plane.device)
-        for members, x, y in _blocks(bounds, rank, features.shape[-1], s):
+        for members, x, y in pixel_blocks(bounds, rank, s.width, s.height, features.shape[-1] + _OWN):
             leaves = [tensor.detach()[members].double() for tensor in (plane, fade, features, alpha)]
             colour, cover = _blend_pixels(*leaves, x, y, s)
             image[:, y, x], opacity[y, x] = colour, cover
@@ -82,35 +82,16 @@ class _Blend(torch.autograd.Function):
         grad_image, grad_opacity = grads
         inputs = (plane, fade, features, alpha)
         totals = [torch.zeros(tensor.shape, dtype=torch.float64, device=tensor.device) for tensor in inputs]
-        for members, x, y in _blocks(bounds, rank, features.shape[-1], ctx.settings):
+        s: BlendSettings = ctx.settings
+        for members, x, y in pixel_blocks(bounds, rank, s.width, s.height, features.shape[-1] + _OWN):
             with torch.enable_grad():
                 leaves = [tensor.detach()[members].double().requires_grad_() for tensor in inputs]
-                outputs = _blend_pixels(*leaves, x, y, ctx.settings)
+                outputs = _blend_pixels(*leaves, x, y, s)
                 parts = torch.autograd.grad(outputs, leaves, (grad_image[:, y, x], grad_opacity[y, x]))
             for total, part in zip(totals, parts, strict=True):
                 total.index_add_(0, members, part)
         cast = [total.to(tensor.dtype) for total, tensor in zip(totals, inputs, strict=True)]
         return *cast, None, None, None
-
-
-def _blocks(bounds: Tensor, rank: Tensor, channels: int, settings: BlendSettings):
-    """Yields (members, x, y): billboards in rank order that may touch a block, and its pixels."""
-    x0, y0, x1, y1 = bounds[rank].unbind(-1)
-    for top in range(0, settings.height, _BLOCK):
-        bottom = min(top + _BLOCK, settings.height)
-        in_rows = (y0 <= bottom) & (y1 >= top) & (x0 <= x1)
-        for left in range(0, settings.width, _BLOCK):
-            right = min(left + _BLOCK, settings.width)
-            members = rank[in_rows & (x0 <= right) & (x1 >= left)]
-            if len(members) == 0:
-                continue
-            y, x = torch.meshgrid(
-                torch.arange(top, bottom, device=bounds.device),
-                torch.arange(left, right, device=bounds.device),
-                indexing="ij",
-            )
-            step = max(1, _BUDGET // (len(members) * (channels + 4)))
-            yield from ((members, px, py) for px, py in zip(x.ravel().split(step), y.ravel().split(step), strict=True))
 
 
 def _blend_pixels(
@@ -218,7 +199,7 @@ def critical_pixels(
     """
     s = settings
     critical = torch.zeros(s.height, s.width, dtype=torch.bool, device=alpha.device)
-    for members, x, y in _blocks(projection.bounds, rank, 1, s):
+    for members, x, y in pixel_blocks(projection.bounds, rank, s.width, s.height, 1 + _OWN):
         plane, fade, textures = (t.detach()[members].double() for t in (projection.plane, projection.fade, alpha))
         open_settings = BlendSettings(s.width, s.height, s.queue, s.near / (1 + tolerance), 0.0, s.alpha_max, 0.0,
                                       s.support)  # fmt: skip

@@ -4,18 +4,15 @@ Slow and simple. Memory stays bounded because the image is worked through in blo
 forward and backward; a block's backward repeats its forward.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from nbavatar.raster.blocks import pixel_blocks
 from nbavatar.splat.projection import FAINTEST, Projection, support_box
 
 __all__ = ["SplatSettings", "blend_reference", "critical_pixels"]
-
-_BLOCK = 32  # pixels a side of a block
-_BUDGET = 4_000_000  # largest number of float64 values in one intermediate of a block
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ class _Blend(torch.autograd.Function):
     def forward(ctx, form, opacities, colours, box, rank, settings):
         s: SplatSettings = settings
         image = torch.zeros(4, s.height, s.width, dtype=torch.float64, device=form.device)
-        for members, x, y in _blocks(box, rank, s):
+        for members, x, y in pixel_blocks(box, rank, s.width, s.height, 1):
             leaves = [tensor.detach()[members].double() for tensor in (form, opacities, colours)]
             image[:, y, x] = _blend_pixels(*leaves, x, y, s)
         ctx.save_for_backward(form, opacities, colours, box, rank)
@@ -74,35 +71,16 @@ class _Blend(torch.autograd.Function):
         grad_image = torch.cat([grads[0], grads[1][None]])
         inputs = (form, opacities, colours)
         totals = [torch.zeros(tensor.shape, dtype=torch.float64, device=tensor.device) for tensor in inputs]
-        for members, x, y in _blocks(box, rank, ctx.settings):
+        s: SplatSettings = ctx.settings
+        for members, x, y in pixel_blocks(box, rank, s.width, s.height, 1):
             with torch.enable_grad():
                 leaves = [tensor.detach()[members].double().requires_grad_() for tensor in inputs]
-                outputs = _blend_pixels(*leaves, x, y, ctx.settings)
+                outputs = _blend_pixels(*leaves, x, y, s)
                 parts = torch.autograd.grad(outputs, leaves, grad_image[:, y, x])
             for total, part in zip(totals, parts, strict=True):
                 total.index_add_(0, members, part)
         cast = [total.to(tensor.dtype) for total, tensor in zip(totals, inputs, strict=True)]
         return *cast, None, None, None
-
-
-def _blocks(box: Tensor, rank: Tensor, settings: SplatSettings) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yields (members, x, y): Gaussians in rank order that may touch a block, and its pixels."""
-    x0, y0, x1, y1 = box[rank].unbind(-1)
-    for top in range(0, settings.height, _BLOCK):
-        bottom = min(top + _BLOCK, settings.height)
-        in_rows = (y0 <= bottom) & (y1 >= top) & (x0 <= x1)
-        for left in range(0, settings.width, _BLOCK):
-            right = min(left + _BLOCK, settings.width)
-            members = rank[in_rows & (x0 <= right) & (x1 >= left)]
-            if len(members) == 0:
-                continue
-            y, x = torch.meshgrid(
-                torch.arange(top, bottom, device=box.device),
-                torch.arange(left, right, device=box.device),
-                indexing="ij",
-            )
-            step = max(1, _BUDGET // len(members))
-            yield from ((members, px, py) for px, py in zip(x.ravel().split(step), y.ravel().split(step), strict=True))
 
 
 def _alphas(form: Tensor, opacities: Tensor, x: Tensor, y: Tensor) -> Tensor:
@@ -145,7 +123,7 @@ def critical_pixels(
     s = settings
     critical = torch.zeros(s.height, s.width, dtype=torch.bool, device=opacities.device)
     _, box = support_box(projection, opacities * (1 + tolerance), s.alpha_min)
-    for members, x, y in _blocks(box, rank, s):
+    for members, x, y in pixel_blocks(box, rank, s.width, s.height, 1):
         raw = _alphas(projection.form[members], opacities[members].double(), x, y)
         _, behind, hit = _weights(raw, s)
         least = max(s.alpha_min, FAINTEST)
