@@ -15,6 +15,7 @@ from torch import Tensor
 from nbavatar.raster import binning
 from nbavatar.raster.compile import run_workers
 from nbavatar.splat import cpu_kernels
+from nbavatar.splat.autograd import blend_scene
 from nbavatar.splat.compile import prepare
 from nbavatar.splat.lanes import LANES
 from nbavatar.splat.patches import patches_of
@@ -42,22 +43,7 @@ def blend_cpu(
         host = Projection(*(getattr(projection, field.name).cpu() for field in fields(projection)))
         image, alpha = blend_cpu(host, rank.cpu(), opacities.cpu(), colours.cpu(), settings)
         return image.to(device), alpha.to(device)
-    return _Blend.apply(projection.form, opacities.contiguous(), colours.contiguous(), projection, rank, settings)
-
-
-class _Blend(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, form, opacities, colours, projection, rank, settings):
-        scene = _Scene(projection, rank, opacities, colours, settings)
-        ctx.scene = scene
-        ctx.save_for_backward(opacities, colours)
-        return scene.forward()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        _ = ctx.saved_tensors  # raises if a tensor was changed in place since the forward pass
-        return *ctx.scene.backward(*grads), None, None, None
+    return blend_scene(_Scene, projection, rank, opacities, colours, settings)
 
 
 def count_samples(

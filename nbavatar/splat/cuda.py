@@ -14,6 +14,7 @@ from nbavatar.raster import cuda as raster_cuda
 from nbavatar.raster.cuda_kernels import CENTER
 from nbavatar.raster.reference import BlendSettings
 from nbavatar.splat import cuda_kernels
+from nbavatar.splat.autograd import blend_scene
 from nbavatar.splat.patches import patches_of
 from nbavatar.splat.projection import FAINTEST, Projection, support_box
 from nbavatar.splat.reference import SplatSettings
@@ -32,22 +33,7 @@ def blend_cuda(
         DeviceError: the memory needed is not there.
         DependencyError: the package numba-cuda, or a CUDA driver, is missing.
     """
-    return _Blend.apply(projection.form, opacities.contiguous(), colours.contiguous(), projection, rank, settings)
-
-
-class _Blend(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, form, opacities, colours, projection, rank, settings):
-        scene = _Scene(projection, rank, opacities, colours, settings)
-        ctx.scene = scene
-        ctx.save_for_backward(opacities, colours)
-        return scene.forward()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        _ = ctx.saved_tensors  # raises if a tensor was changed in place since the forward pass
-        return *ctx.scene.backward(*grads), None, None, None
+    return blend_scene(_Scene, projection, rank, opacities, colours, settings)
 
 
 class _Scene(raster_cuda._Scene):
