@@ -169,16 +169,14 @@ def assets():
     ]
 
 
-def crops_of(wildcards, variant, crop=None, cameras=None):
-    crop = crop or RUN.variants[variant].crop
-    subject = SUBJECTS[wildcards.subject]
-    cameras = subject.train_cameras if cameras is None else cameras
-    return [f"{R}/crop/{crop}/{subject.name}/{camera}.zip" for camera in cameras]
+def crops_of(crop, subject, cameras):
+    return [f"{R}/crop/{crop}/{subject}/{camera}.zip" for camera in cameras]
 
 
 def train_frames(wildcards):
     """Crops of the training cameras."""
-    return crops_of(wildcards, wildcards.variant)
+    crop, subject = RUN.variants[wildcards.variant].crop, wildcards.subject
+    return crops_of(crop, subject, SUBJECTS[subject].train_cameras)
 
 
 def meshes_of(wildcards):
@@ -213,7 +211,7 @@ def frames_under(protocol, subject):
         if protocol.split == "novel_view"
         else cameras.train_cameras
     )
-    return [f"{R}/crop/{protocol.crop}/{subject}/{camera}.zip" for camera in cameras]
+    return crops_of(protocol.crop, subject, cameras)
 
 
 def protocol_frames(wildcards):
@@ -222,9 +220,8 @@ def protocol_frames(wildcards):
 
 def protocol_train_frames(wildcards):
     """Training crops of the same kind: the mean training image is one of the trivial answers."""
-    return crops_of(
-        wildcards, wildcards.variant, RUN.protocols[wildcards.protocol].crop
-    )
+    crop, subject = RUN.protocols[wildcards.protocol].crop, wildcards.subject
+    return crops_of(crop, subject, SUBJECTS[subject].train_cameras)
 
 
 def evals_of(rows):

@@ -52,7 +52,7 @@ rule video:
     input:
         model="results/{run}/train/{subject}/{variant}/model.pt",
         meshes=meshes_of,
-        camera=lambda w: crops_of(w, w.variant)[0],
+        camera=lambda w: train_frames(w)[0],
     output:
         video=report(
             "results/{run}/video/{subject}/{variant}/{kind}.mp4",
