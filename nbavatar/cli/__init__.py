@@ -13,10 +13,9 @@ import sys
 from collections.abc import Sequence
 
 from nbavatar import __version__
-from nbavatar.cli.warm import call, takes
 from nbavatar.errors import NBAvatarError, did_you_mean
 
-__all__ = ["VERBS", "main"]
+__all__ = ["SOCKET_VARIABLE", "VERBS", "main"]
 
 VERBS = {
     "synthesize": "write a complete synthetic dataset in Decaf's layout, body models included",
@@ -46,6 +45,12 @@ VERBS = {
     "schema": "write the configuration's JSON schema and reference page",
 }
 
+SOCKET_VARIABLE = "NBAVATAR_WARM"
+"""Environment variable with the socket of `nbavatar warm`; set for its command and everything below that."""
+
+# The verbs that are handed over to it.
+_WITH_TORCH = frozenset({"train", "render", "evaluate", "speed", "tradeoff", "extremes", "video", "figure"})
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one verb; returns the exit code (0 done, 2 bad input or usage, 130 interrupted)."""
@@ -59,7 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         print(f"nbavatar: error: unknown verb '{verb}'; {did_you_mean(verb, VERBS)}", file=sys.stderr)
         return 2
-    if argv is None and takes(verb):
+    if argv is None and verb in _WITH_TORCH and SOCKET_VARIABLE in os.environ:
+        from nbavatar.cli.warm import call
+
         return call(arguments)
     try:
         module = importlib.import_module(f"nbavatar.cli.{verb.replace('-', '_')}")

@@ -4,7 +4,7 @@
 
 Importing torch and loading the compiled kernels takes seconds, which is nothing for a training and most of a smoke
 run of dozens of tiny jobs. This process loads them once, while COMMAND is already running. `nbavatar train`, `render`,
-`evaluate` and `speed` below COMMAND then hand their arguments, folder, environment and open streams to it over a
+`evaluate` and the like below COMMAND then hand their arguments, folder, environment and open streams to it over a
 socket, and it forks a process that runs them: one process a job, as ever, with nothing shared but what was loaded.
 A job whose caller disappears is terminated. Linux and macOS, without a GPU (CUDA does not survive a fork).
 
@@ -26,25 +26,17 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from nbavatar.cli import SOCKET_VARIABLE
 from nbavatar.errors import ConfigError
 
-__all__ = ["SOCKET_VARIABLE", "add_arguments", "call", "main", "takes"]
+__all__ = ["add_arguments", "call", "main"]
 
-SOCKET_VARIABLE = "NBAVATAR_WARM"
-"""Environment variable with the path of the socket; set for the command and everything below it."""
-
-_VERBS = frozenset({"train", "render", "evaluate", "speed", "tradeoff", "extremes", "video", "figure"})
 _LONGEST = 1 << 20  # bytes of a request: arguments and environment
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options of `nbavatar warm`."""
     parser.add_argument("command", nargs=argparse.REMAINDER, metavar="-- COMMAND ...", help="what to run")
-
-
-def takes(verb: str) -> bool:
-    """Whether this process should hand the verb over instead of running it."""
-    return verb in _VERBS and SOCKET_VARIABLE in os.environ
 
 
 def call(argv: Sequence[str]) -> int:
