@@ -99,4 +99,7 @@ class DeformConfig:
     settle: int = option(4, "Steps after the hand has arrived.", min=0, max=1000)
     iterations: int = option(8, "Sweeps over all constraints in a step.", min=1, max=10000)
     time_step: float = option(0.002, "Time that a step stands for: longer is nearer to rest [s].", min=1.0e-6, max=1.0)
+    contact_only: bool = option(
+        True, "Whether only frames and regions that contact reaches are simulated; false simulates everything."
+    )
     picture_size: int = option(480, "Side of one view of the validation picture [px].", min=64, max=4096)

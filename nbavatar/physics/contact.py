@@ -50,6 +50,7 @@ class ContactNumbers:
     iterations: int = 8  # per step
     time_step: float = 0.002  # [s]
     repair: int = 40  # rounds of the final projection
+    contact_only: bool = True  # False simulates all frames and all of the head
 
 
 class FrameResult(NamedTuple):
@@ -134,7 +135,7 @@ class ContactSolver:
         head = np.ascontiguousarray(head, np.float64)
         hands = [np.ascontiguousarray(hand, np.float64) for hand in hands]
         depth, free = self._probe(head, hands)
-        if free is not None:
+        if free is not None and n.contact_only:
             return free
         outward = self._outward(head)
         dent, pose, start = self._begin(head, hands, outward, before, head_before, hands_before)
@@ -145,7 +146,7 @@ class ContactSolver:
         old = np.abs(dent).max(axis=1) > 1e-6
         touched = np.zeros(self._count, bool)
         # What was dented in the frame before springs back, touched or not.
-        active = np.flatnonzero(old)
+        active = self._active(touched, old)
         local = self._local(active, head)
         last = [self._posed(s, pose[k], centre[k]) for k, s in enumerate(start)]
         total = path + n.settle
@@ -178,7 +179,7 @@ class ContactSolver:
         deepest, head_contact, hand_contact = 0.0, np.zeros(self._count, bool), []
         for k, (mesh, hand, count) in enumerate(zip(self._hands, hands, self._hand_counts, strict=True)):
             mesh.move(hand)
-            if self._head.clear_of(mesh, n.touch):
+            if n.contact_only and self._head.clear_of(mesh, n.touch):
                 hand_contact.append(np.zeros(count, bool))
                 continue
             overlap = estimate_overlap(self._head, mesh, self._edges_with(k), (self._count, count), n.touch)
@@ -266,6 +267,10 @@ class ContactSolver:
 
     def _active(self, touched: np.ndarray, old: np.ndarray) -> np.ndarray:
         """Vertices within reach of what is touched, along the surface, and those that were dented before."""
+        if not self.numbers.contact_only:
+            return np.arange(self._count)
+        if not touched.any():
+            return np.flatnonzero(old)
         distance = scipy.sparse.csgraph.dijkstra(
             self._graph, directed=False, indices=np.flatnonzero(touched), limit=self.numbers.reach, min_only=True
         )

@@ -101,6 +101,19 @@ def test_free_frames_are_returned_as_they_are(gap):
     assert result.head_contact.any() == (gap < 0.002)
 
 
+def test_without_contact_only_everything_is_simulated():
+    solver, everywhere = _solver(), _solver(contact_only=False)
+    free = everywhere.solve(HEAD, [press(HAND, -0.3)])
+    assert free.active == len(HEAD) and free.steps > 0
+    np.testing.assert_allclose(free.head, HEAD, atol=1e-12)
+    np.testing.assert_array_equal(free.hands[0], press(HAND, -0.3))
+    near, whole = (one.solve(HEAD, [press(HAND, 0.006)]) for one in (solver, everywhere))
+    assert near.active < len(HEAD) == whole.active
+    assert _depth(whole.head, whole.hands[0]) < 2e-4
+    # Beyond the reach of contact nothing moves much: the local answer stands for the whole one.
+    np.testing.assert_allclose(near.head, whole.head, atol=1e-3)
+
+
 def test_deterministic():
     first, second = (_solver().solve(HEAD, [press(HAND, 0.012)]) for _ in range(2))
     assert first.head.tobytes() == second.head.tobytes() and first.hands[0].tobytes() == second.hands[0].tobytes()
