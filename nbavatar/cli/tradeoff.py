@@ -6,13 +6,15 @@
     --train-frames  packs of the training cameras: their views decide which billboards contribute
     --protocol      JSON text, a file, or a name (nv1024, ...): which frames of the packs, on which background
     --sheet         JSON text or file: knobs, values, limits of the presets (see config/tradeoff.yaml)
+    --enlarge       render so many times as large as the frames (1024 px from frames of 512: 2); quality is judged on
+                    the pictures averaged down to the frames' size
     --out           folder: points.jsonl (log; a sweep that was stopped goes on from it), points.csv (one row a
                     point), points.md, knobs.md (a paragraph a knob), front_{ms,memory,bytes}.{png,pdf}, presets.json,
                     tradeoff.json (all of it, with the run's record); presets.json is also put beside the model, where
                     `--preset` of render, speed and train finds it
 
-Each point: PSNR [dB], SSIM, LPIPS on the held-out images; largest difference [1] to the exact setting and share of the
-pixels that differ by more than 1/255; milliseconds by stage, taken in turn with the exact setting; peak memory, size of
+Each point: PSNR [dB], SSIM, LPIPS on the held-out images; largest difference [1] to the exact setting's pictures, share
+of the pixels that differ by more than 1/255, PSNR and LPIPS between the two; milliseconds by stage, taken in turn with the exact setting; peak memory, size of
 the avatar. `--savings` measures instead every "only what a scene requires" switch, on and off (savings.{csv,md});
 `--offline` the stages before training (offline.{csv,md,png}): contact iterations and substeps, refit, spectral modes,
 coarser meshes.
@@ -50,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--protocol", default="nv1024", metavar="JSON|FILE|NAME", help="which held-out images")
     parser.add_argument("--sheet", default="{}", metavar="JSON|FILE", help="knobs and values (TradeoffConfig)")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder of the results")
+    parser.add_argument("--enlarge", type=int, default=1, metavar="N", help="picture size, in frame sizes")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
     parser.add_argument("--max-minutes", type=float, metavar="MIN", help="stop after this time; a later call goes on")
     parser.add_argument("--no-store", action="store_true", help="do not put presets.json beside the model")
@@ -67,6 +70,8 @@ def main(args: argparse.Namespace) -> int:
     for name in ("model", "frames"):
         if not getattr(args, name):
             raise ConfigError.of(f"--{name}", expected="one file or more", found="none")
+    if args.enlarge < 1:
+        raise ConfigError.of("--enlarge", expected="1 or more", found=str(args.enlarge))
     protocol = read_protocol(args.protocol, "nv")
     with lease_device(args.device) as device, ExitStack() as stack:
         packs = [stack.enter_context(FramePack(path)) for path in args.frames]
@@ -116,7 +121,7 @@ def _sweep(
     for model in models:
         check_parts(model.avatar, sequence)
     net = load_lpips(sheet.net).to(device)
-    shots, size = _shots(sheet, protocol, sequence, models[0].avatar.parts, packs, net, device)
+    shots, size = _shots(args, sheet, protocol, sequence, models[0].avatar.parts, packs, net, device)
     label = timed_device(device)
     inputs = {f"model.{i}": path for i, path in enumerate(args.model)} | {"meshes": args.meshes}
     inputs |= {f"frames.{i}": path for i, path in enumerate(args.frames)}
@@ -127,6 +132,8 @@ def _sweep(
         "background": protocol.background,
         "refined": protocol.refined,
         "net": sheet.net,
+        "enlarge": args.enlarge,
+        "values": 2,  # counted up when a point holds other figures
         "code": code_digest("render"),  # what draws; an edit of figures or words measures nothing anew
     }
     chooser = _Chooser(trains or packs, sequence, sheet.importance_views, device)
@@ -180,9 +187,11 @@ def _write_results(
     steady = dict(zip(map(id, result.points), points := steadied(result.points), strict=True))
     presets = {name: steady[id(point)] for name, point in result.presets.items()}
     exact, own = points[0], [point for point in points if point.model == points[0].model]
-    caption = f"{device}; {size[0]}x{size[1]} px, {images} held-out images" + (
-        "" if result.complete else "; sweep stopped early"
-    )
+    caption = f"{device}; {size[0]}x{size[1]} px, {images} held-out images"
+    if args.enlarge > 1:
+        caption += f" of {size[0] // args.enlarge}x{size[1] // args.enlarge} px"
+    if not result.complete:
+        caption += "; sweep stopped early"
     rows = point_rows(points, presets, device)
     _write(out / "points.csv", rows_csv(rows))
     _write(out / "points.md", f"{caption}\n\n{points_markdown(points, presets)}")
@@ -200,7 +209,7 @@ def _write_results(
     for place in places:
         store_presets(place, model=digest, device=device, size=size, presets=entries, points=own, importance=importance)
     summary = {
-        "kind": "tradeoff", "format": 1, "device": device, "size": list(size), "images": images,
+        "kind": "tradeoff", "format": 1, "device": device, "size": list(size), "enlarge": args.enlarge, "images": images,
         "complete": result.complete, "presets": entries, "paragraphs": paragraphs, "points": rows, "record": record,
     }  # fmt: skip
     write_json(out / "tradeoff.json", summary)
@@ -222,8 +231,8 @@ def _models(paths: list[str], device: str) -> list[Any]:
 
 
 def _shots(
-    sheet: TradeoffConfig, protocol: ProtocolConfig, sequence: Any, parts: list[str], packs: list[FramePack], net: Any,
-    device: str,
+    args: argparse.Namespace, sheet: TradeoffConfig, protocol: ProtocolConfig, sequence: Any, parts: list[str],
+    packs: list[FramePack], net: Any, device: str,
 ) -> tuple[list[Any], tuple[int, int]]:  # fmt: skip
     """The held-out pictures, evenly spaced over cameras and time, and their size [px]."""
     from nbavatar.data.views import views_of
@@ -240,9 +249,10 @@ def _shots(
             raise DataError.of(packs[view.pack].path, "size", expected=expected, found=found)
     truths = [(packs[view.pack].read("rgb", view.frame), packs[view.pack].read("alpha", view.frame)) for view in chosen]
     shots = prepare_shots(
-        sequence, parts, chosen, truths, protocol.background, net, refined=protocol.refined, device=device
-    )
-    return shots, size
+        sequence, parts, chosen, truths, protocol.background, net, refined=protocol.refined, enlarge=args.enlarge,
+        device=device,
+    )  # fmt: skip
+    return shots, (args.enlarge * size[0], args.enlarge * size[1])
 
 
 class _Chooser:

@@ -3,6 +3,10 @@
 Times are taken in pairs, a picture at the exact setting beside each picture at the setting in question, and the
 speed-up is the median of their ratios: on a shared machine both are slowed alike, so ratios are far steadier than
 milliseconds.
+
+Pictures may be rendered larger than the frames that judge them: quality is then measured on the pictures averaged down
+to the frames' size, since there is no truth beyond it, and how far they are from the exact setting's pictures at full
+size, which is where lost detail shows.
 """
 
 import contextlib
@@ -11,20 +15,24 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
+from nbavatar.camera.pinhole import scale_intrinsics
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
-from nbavatar.evaluation.evaluate import composite, measure
+from nbavatar.evaluation.evaluate import PSNR_CAP, composite, measure
 from nbavatar.metrics.lpips import LPIPS
+from nbavatar.metrics.psnr import psnr
 from nbavatar.tradeoff.reduce import avatar_bytes
 from nbavatar.tradeoff.tuned import TunedAvatar
 
-__all__ = ["STAGES", "Shot", "difference", "measure_point", "peak_memory_mb", "prepare_shots", "time_pairs"]
+__all__ = ["STAGES", "Reference", "Shot", "difference", "measure_point", "peak_memory_mb", "prepare_shots",
+           "quality", "reference", "time_pairs"]  # fmt: skip
 
 STAGES = ("pose", "raster", "renderer", "compose")
 _LEVEL = 1.0 / 255.0
@@ -36,7 +44,7 @@ class Shot:
 
     Attributes:
         verts: vertices per part, float32 (V, 3) [m].
-        view: camera and frame.
+        view: camera and frame; its size is the truth's, or a whole multiple of it.
         viewmat, K: on the device.
         frame: id given to the avatar (its refinement of training frames), or None.
         background: RGB (3,).
@@ -72,6 +80,7 @@ def prepare_shots(
     net: LPIPS,
     *,
     refined: bool,
+    enlarge: int = 1,
     device: str,
 ) -> list[Shot]:
     """Held-out pictures and what they are judged by.
@@ -84,6 +93,7 @@ def prepare_shots(
         background: sRGB in [0, 1].
         net: LPIPS on `device`.
         refined: whether training frames use their refinement.
+        enlarge: pictures are this many times as large as the truth.
         device: where the avatar computes.
     """
     shots = []
@@ -95,6 +105,8 @@ def prepare_shots(
             part: torch.from_numpy(np.asarray(sequence.parts[part].verts[view.row], dtype=np.float32)).to(device)
             for part in parts
         }
+        K = torch.from_numpy(scale_intrinsics(view.K.numpy(), enlarge, enlarge)).float()
+        view = view._replace(width=enlarge * view.width, height=enlarge * view.height, K=K)
         shots.append(
             Shot(
                 verts, view, view.viewmat.to(device), view.K.to(device), view.frame if refined else None,
@@ -108,7 +120,7 @@ def prepare_shots(
 def measure_point(
     avatar: TunedAvatar,
     exact: TunedAvatar,
-    pictures: Sequence[Tensor],
+    pictures: Sequence["Reference"],
     shots: Sequence[Shot],
     net: LPIPS,
     *,
@@ -121,7 +133,7 @@ def measure_point(
     Args:
         avatar: under the setting.
         exact: under the exact setting (the same object for that point itself).
-        pictures: what `exact` shows of the shots, each (3, H, W).
+        pictures: what `exact` shows of the shots.
         shots: held-out pictures.
         net: LPIPS.
         repeats, warmup: timed pairs, and pairs before timing starts.
@@ -129,18 +141,17 @@ def measure_point(
 
     Returns:
         JSON-ready: `psnr` and `psnr_fg` [dB], `ssim`, `lpips`; `diff_max` [1] and `diff_share` (of the pixels that
-        differ by more than 1/255 in a channel) against the exact setting; `ms` by stage and `total` (medians),
+        differ by more than 1/255 in a channel), `psnr_apart` [dB] and `lpips_apart` against the exact setting's pictures
+        at full size; `ms` by stage and `total` (medians),
         `exact_ms` (median of the paired exact pictures), `speedup`; `peak_memory_mb` (tensors of the avatar and what
         a picture needs besides); `model_mb`; `work` a picture.
     """
-    rows, largest, shares = [], 0.0, []
+    rows, apart = [], []
     before = asdict(avatar.work)
-    for shot, reference in zip(shots, pictures, strict=True):
+    for shot, picture in zip(shots, pictures, strict=True):
         image = shot.render(avatar)[0]
-        worst, share = difference(image, reference)
-        largest, shares = max(largest, worst), [*shares, share]
-        stored = torch.round(image.clamp(0.0, 1.0) * 255.0) / 255.0  # as a render is written and judged
-        rows.append(measure(stored[None], shot.truth, shot.mask, {"net": net}, {"net": shot.features}))
+        rows.append(quality(image, shot, net))
+        apart.append(difference(image, picture, net))
     work = {name: round((value - before[name]) / len(shots), 1) for name, value in asdict(avatar.work).items()}
     work.pop("pictures")
     times = time_pairs(avatar, exact, shots, repeats=repeats, warmup=warmup, device=device)
@@ -149,8 +160,8 @@ def measure_point(
         "psnr_fg": _mean(rows, "psnr_fg"),
         "ssim": _mean(rows, "ssim"),
         "lpips": _mean(rows, "lpips_net"),
-        "diff_max": largest,
-        "diff_share": sum(shares) / len(shares),
+        "diff_max": max(row["diff_max"] for row in apart),
+        **{name: _mean(apart, name) for name in ("diff_share", "psnr_apart", "lpips_apart")},
         **times,
         "peak_memory_mb": round(peak_memory_mb(avatar, shots[0], device), 1),
         "model_mb": round(avatar_bytes(avatar.avatar) / 1e6, 3),
@@ -158,12 +169,48 @@ def measure_point(
     }
 
 
-def difference(image: Tensor, reference: Tensor) -> tuple[float, float]:
-    """Largest absolute difference of two pictures (3, H, W), and the share of their pixels where any channel differs by
-    more than 1/255.
+class Reference(NamedTuple):
+    """A picture that others are compared with, (3, H, W), and the LPIPS features of what is stored of it."""
+
+    image: Tensor
+    features: Sequence[Tensor]
+
+
+def reference(image: Tensor, net: LPIPS) -> Reference:
+    """A picture (3, H, W) to compare others with."""
+    with torch.inference_mode():
+        return Reference(image, net.features(_stored(image)))
+
+
+def difference(image: Tensor, other: Reference, net: LPIPS) -> dict[str, float]:
+    """How far a picture (3, H, W) is from another of its size.
+
+    Returns:
+        `diff_max`: largest absolute difference [1]; `diff_share`: share of the pixels where any channel differs by
+        more than 1/255; `psnr_apart` [dB] and `lpips_apart` of the two as they are stored.
     """
-    apart = (image - reference).abs().amax(0)
-    return float(apart.max()), float((apart > _LEVEL * (1.0 + 1e-4)).float().mean())
+    apart = (image - other.image).abs().amax(0)
+    with torch.inference_mode():
+        distance = net.distance(net.features(_stored(image)), other.features)
+    return {
+        "diff_max": float(apart.max()),
+        "diff_share": float((apart > _LEVEL * (1.0 + 1e-4)).float().mean()),
+        "psnr_apart": min(float(psnr(_stored(image), _stored(other.image))), PSNR_CAP),
+        "lpips_apart": float(distance),
+    }
+
+
+def quality(image: Tensor, shot: Shot, net: LPIPS) -> dict[str, float | None]:
+    """Metrics of a picture (3, H, W) of a shot against its truth, averaged down to the truth's size."""
+    times = image.shape[-1] // shot.truth.shape[-1]
+    return measure(
+        functional.avg_pool2d(_stored(image), times), shot.truth, shot.mask, {"net": net}, {"net": shot.features}
+    )
+
+
+def _stored(image: Tensor) -> Tensor:
+    """A picture (3, H, W) as it is written, 8 bits a channel, as a batch of one."""
+    return torch.round(image.clamp(0.0, 1.0)[None] * 255.0) / 255.0
 
 
 def time_pairs(

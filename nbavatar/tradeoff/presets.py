@@ -48,11 +48,13 @@ def preset_entry(name: str, point: Point, exact: Point, limits: LimitConfig | No
         "name": name,
         "setting": to_mapping(point.setting),
         "label": point.label,
-        "why": f"{rule}: {point.speedup:.2f}x as fast, {0.0 - psnr:+.3f} dB, {lpips:+.4f} LPIPS",
+        "why": f"{rule}: {point.speedup:.2f}x as fast, {0.0 - psnr:+.3f} dB, {lpips:+.4f} LPIPS, "
+        f"{point.values['lpips_apart']:.4f} LPIPS from the exact pictures",
         "speedup": point.speedup,
         "psnr_lost": psnr,
         "lpips_gained": lpips,
         "diff_share": point.values["diff_share"],
+        "lpips_apart": point.values["lpips_apart"],
         "ms": point.ms,
     }
 

@@ -6,9 +6,9 @@ the two are compared with each other, and with the truth where there is one.
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import torch
@@ -16,9 +16,8 @@ from torch import Tensor
 
 from nbavatar.avatar.model import Avatar
 from nbavatar.config.tradeoff import SettingConfig, TradeoffConfig, vary
-from nbavatar.evaluation.evaluate import measure
 from nbavatar.metrics.lpips import LPIPS
-from nbavatar.tradeoff.measure import Shot, difference, peak_memory_mb, time_pairs
+from nbavatar.tradeoff.measure import Shot, difference, peak_memory_mb, quality, reference, time_pairs
 from nbavatar.tradeoff.reduce import avatar_bytes, keep_parts
 from nbavatar.tradeoff.tuned import TunedAvatar
 
@@ -70,22 +69,22 @@ def measure_savings(
 
     Returns:
         One row a switch: `saving`, `scene`, `on_ms`, `off_ms`, `faster` (median ratio of paired pictures), memory and
-        bytes on and off, largest difference and share of the pixels that differ by more than 1/255, change of PSNR
-        and LPIPS against the truth where there is one (else None), and the work counted, on and off.
+        bytes on and off, largest difference, share of the pixels that differ by more than 1/255 and LPIPS between
+        the two, change of PSNR and LPIPS against the truth where there is one (else None), and the work counted, on and off.
     """
     rows = []
     for switch in _switches(avatar, shots, importance):
         times = time_pairs(
             switch.on, switch.off, switch.shots, repeats=sheet.repeats, warmup=sheet.warmup, device=device
         )
-        worst, shares, changes = 0.0, [], []
+        apart, changes = [], []
         work = {"on": _counted(switch.on, switch.shots[0]), "off": _counted(switch.off, switch.shots[0])}
         for shot in switch.shots:
             on, off = shot.render(switch.on)[0], shot.render(switch.off)[0]
-            most, share = difference(on, off)
-            worst, shares = max(worst, most), [*shares, share]
+            apart.append(difference(on, reference(off, net), net))
             if switch.judged:
-                changes.append([b - a for a, b in zip(_quality(off, shot, net), _quality(on, shot, net), strict=True)])
+                without, with_it = quality(off, shot, net), quality(on, shot, net)
+                changes.append([(with_it[name] or 0.0) - (without[name] or 0.0) for name in ("psnr", "lpips_net")])
         memory = [peak_memory_mb(side, switch.shots[0], device) for side in (switch.on, switch.off)]
         rows.append(
             {
@@ -98,10 +97,10 @@ def measure_savings(
                 "off_memory_mb": round(memory[1], 1),
                 "on_mb": round(avatar_bytes(switch.on.avatar) / 1e6, 3),
                 "off_mb": round(avatar_bytes(switch.off.avatar) / 1e6, 3),
-                "diff_max": worst,
-                "diff_share": math.fsum(shares) / len(shares),
-                "psnr_change": math.fsum(c[0] for c in changes) / len(changes) if changes else None,
-                "lpips_change": math.fsum(c[1] for c in changes) / len(changes) if changes else None,
+                "diff_max": max(row["diff_max"] for row in apart),
+                **{name: fmean(row[name] for row in apart) for name in ("diff_share", "lpips_apart")},
+                "psnr_change": fmean(c[0] for c in changes) if changes else None,
+                "lpips_change": fmean(c[1] for c in changes) if changes else None,
                 **{f"{side}_{name}": value for side in work for name, value in work[side].items()},
             }
         )
@@ -201,11 +200,3 @@ def _counted(avatar: TunedAvatar, shot: Shot) -> dict[str, int]:
     counted = {name: value - before[name] for name, value in asdict(avatar.work).items()}
     counted.pop("pictures")
     return counted
-
-
-def _quality(image: Tensor, shot: Shot, net: LPIPS) -> tuple[float, float]:
-    stored = torch.round(image.clamp(0.0, 1.0) * 255.0) / 255.0
-    values = measure(stored[None], shot.truth, shot.mask, {"net": net}, {"net": shot.features})
-    psnr, lpips = values["psnr"], values["lpips_net"]
-    assert psnr is not None and lpips is not None
-    return psnr, lpips

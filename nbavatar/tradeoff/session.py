@@ -14,7 +14,7 @@ from nbavatar.config.tradeoff import SettingConfig, TradeoffConfig
 from nbavatar.metrics.lpips import LPIPS
 from nbavatar.tradeoff.contribution import contributions
 from nbavatar.tradeoff.front import Point, describe
-from nbavatar.tradeoff.measure import Shot, measure_point
+from nbavatar.tradeoff.measure import Reference, Shot, measure_point, reference
 from nbavatar.tradeoff.sweep import PointLog, first_settings, run_sweep
 from nbavatar.tradeoff.tuned import TunedAvatar
 
@@ -67,7 +67,7 @@ class Session:
     ) -> None:
         self._sheet, self._models, self._shots, self._importance = sheet, list(models), list(shots), importance
         self._net, self._log, self._identity, self._device, self._on_point = net, log, identity, device, on_point
-        self._exact: tuple[TunedAvatar, list[Tensor]] | None = None
+        self._exact: tuple[TunedAvatar, list[Reference]] | None = None
 
     def run(self, should_stop: Callable[[], bool] | None = None) -> SweepResult:
         """Measures the sheet on the first model, and its exact setting, combinations and presets on the others."""
@@ -111,11 +111,11 @@ class Session:
         importance = self._importance(model) if setting.billboards < 1.0 else None
         return TunedAvatar(model.avatar, setting, importance=importance)
 
-    def _reference(self) -> tuple[TunedAvatar, list[Tensor]]:
+    def _reference(self) -> tuple[TunedAvatar, list[Reference]]:
         """The first model at the exact setting, and its pictures."""
         if self._exact is None:
             exact = self.tuned(self._models[0], self._sheet.exact)
-            self._exact = exact, [shot.render(exact)[0] for shot in self._shots]
+            self._exact = exact, [reference(shot.render(exact)[0], self._net) for shot in self._shots]
         return self._exact
 
     def _key(self, model: Candidate, setting: SettingConfig) -> str:

@@ -45,6 +45,8 @@ def point_rows(points: Sequence[Point], presets: Mapping[str, Point], device: st
                 "lpips_gained": lpips,
                 "diff_max": v["diff_max"],
                 "diff_share": v["diff_share"],
+                "psnr_apart": v["psnr_apart"],
+                "lpips_apart": v["lpips_apart"],
                 **{f"{stage}_ms": v["ms"][stage] for stage in (*STAGES, "total")},
                 "exact_ms": v["exact_ms"],
                 "steady_ms": point.ms,
@@ -76,7 +78,7 @@ def points_markdown(points: Sequence[Point], presets: Mapping[str, Point]) -> st
     """A table to read, the fastest first; changes of quality are against the exact setting."""
     exact = points[0]
     head = ["setting", "preset", "ms", "raster", "U-Net", "compose", "faster", "PSNR [dB]", "change", "LPIPS", "change",
-            "pixels changed", "memory [MB]", "avatar [MB]"]  # fmt: skip
+            "pixels changed", "LPIPS from exact", "memory [MB]", "avatar [MB]"]  # fmt: skip
     several = len({point.model for point in points}) > 1
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * 2 + "---:|" * (len(head) - 2)]
     for point in sorted(points, key=lambda p: (p.ms, p.label)):
@@ -94,6 +96,7 @@ def points_markdown(points: Sequence[Point], presets: Mapping[str, Point]) -> st
             f"{v['lpips']:.4f}",
             f"{lpips:+.4f}",
             f"{100 * v['diff_share']:.2f}%",
+            f"{v['lpips_apart']:.4f}",
             f"{v['peak_memory_mb']:.0f}",
             f"{v['model_mb']:.2f}",
         ]

@@ -60,6 +60,8 @@ def point_sentence(point: Point, exact: Point, name: str, base: str) -> str:
         share = values["diff_share"]
         percent = "no pixel" if share == 0 else f"{100 * share:.2g}% of the pixels"
         change = f"changes {percent} by more than 1/255 (most: {255 * values['diff_max']:.1f}/255)"
+        if values["lpips_apart"] >= _SAME_LPIPS:
+            change += f", {values['lpips_apart']:.4f} LPIPS away"
         if abs(psnr) < _SAME_PSNR and abs(lpips) < _SAME_LPIPS:
             change += " and no quality figure"
         else:
