@@ -32,7 +32,7 @@ rule table:
         code=code_digest("table"),
     shell:
         "nbavatar table --table {wildcards.table} --layout {input.layout} --reported {input.reported}"
-        " --evals {input.evals} --speeds {input.speeds} --out-stem {params.stem} --size-label {params.label:q}"
+        " --evals {input.evals} --speeds {input.speeds} --out-stem {params.stem} --size-label={params.label:q}"
         " --cfg {params.cfg:q} > {log} 2>&1"
 
 
@@ -72,5 +72,5 @@ rule report:
         "nbavatar report --tables {input.tables} {input.contact} --evals {input.evals} --renders {input.renders}"
         " --speeds {input.speeds} --frames {input.frames} --histories {input.histories}"
         " --pictures {input.pictures} --videos {input.videos} --tradeoffs {input.tradeoffs}"
-        " --extremes {input.extremes} --size-label {params.label:q}"
+        " --extremes {input.extremes} --size-label={params.label:q}"
         " --out {output} --cfg {params.cfg:q} > {log} 2>&1"
