@@ -6,21 +6,22 @@
     --train-frames  packs of the training cameras: their views decide which billboards contribute
     --protocol      JSON text, a file, or a name (nv1024, ...): which frames of the packs, on which background
     --sheet         JSON text or file: knobs, values, limits of the presets (see config/tradeoff.yaml)
-    --enlarge       render so many times as large as the frames (1024 px from frames of 512: 2); quality is judged on
-                    the pictures averaged down to the frames' size
+    --side          longer side of the pictures [px]: smaller frames are rendered so many times (a whole number) as large
+                    that it is reached; quality is judged on the pictures averaged down to the frames' size
     --out           folder: points.jsonl (log; a sweep that was stopped goes on from it), points.csv (one row a
                     point), points.md, knobs.md (a paragraph a knob), front_{ms,memory,bytes}.{png,pdf}, presets.json,
                     tradeoff.json (all of it, with the run's record); presets.json is also put beside the model, where
                     `--preset` of render, speed and train finds it
 
 Each point: PSNR [dB], SSIM, LPIPS on the held-out images; largest difference [1] to the exact setting's pictures, share
-of the pixels that differ by more than 1/255, PSNR and LPIPS between the two; milliseconds by stage, taken in turn with the exact setting; peak memory, size of
-the avatar. `--savings` measures instead every "only what a scene requires" switch, on and off (savings.{csv,md});
-`--offline` the stages before training (offline.{csv,md,png}): contact iterations and substeps, refit, spectral modes,
-coarser meshes.
+of the pixels that differ by more than 1/255, PSNR and LPIPS between the two; milliseconds by stage, taken in turn with
+the exact setting; peak memory, size of the avatar. `--savings` measures instead every "only what a scene requires"
+switch, on and off (savings.{csv,md}); `--offline` the stages before training (offline.{csv,md,png}): contact iterations
+and substeps, refit, spectral modes, coarser meshes.
 """
 
 import argparse
+import math
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -40,6 +41,7 @@ from nbavatar.provenance import code_digest, file_digest, run_record
 
 __all__ = ["add_arguments", "main"]
 
+_LONGEST = 8192  # side of a picture [px]
 _CHOOSERS = 4096  # most views kept in mind when contributions are asked for
 
 
@@ -52,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--protocol", default="nv1024", metavar="JSON|FILE|NAME", help="which held-out images")
     parser.add_argument("--sheet", default="{}", metavar="JSON|FILE", help="knobs and values (TradeoffConfig)")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder of the results")
-    parser.add_argument("--enlarge", type=int, default=1, metavar="N", help="picture size, in frame sizes")
+    parser.add_argument("--side", type=int, default=0, metavar="PX", help="least longer side of the pictures")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
     parser.add_argument("--max-minutes", type=float, metavar="MIN", help="stop after this time; a later call goes on")
     parser.add_argument("--no-store", action="store_true", help="do not put presets.json beside the model")
@@ -70,8 +72,8 @@ def main(args: argparse.Namespace) -> int:
     for name in ("model", "frames"):
         if not getattr(args, name):
             raise ConfigError.of(f"--{name}", expected="one file or more", found="none")
-    if args.enlarge < 1:
-        raise ConfigError.of("--enlarge", expected="1 or more", found=str(args.enlarge))
+    if not 0 <= args.side <= _LONGEST:
+        raise ConfigError.of("--side", expected=f"0 to {_LONGEST}", found=str(args.side))
     protocol = read_protocol(args.protocol, "nv")
     with lease_device(args.device) as device, ExitStack() as stack:
         packs = [stack.enter_context(FramePack(path)) for path in args.frames]
@@ -132,7 +134,7 @@ def _sweep(
         "background": protocol.background,
         "refined": protocol.refined,
         "net": sheet.net,
-        "enlarge": args.enlarge,
+        "size": size,
         "values": 2,  # counted up when a point holds other figures
         "code": code_digest("render"),  # what draws; an edit of figures or words measures nothing anew
     }
@@ -162,10 +164,11 @@ def _sweep(
     limit = None if args.max_minutes is None else 60.0 * args.max_minutes
     result = session.run(None if limit is None else lambda: time.monotonic() - began > limit)
     importance = chooser.largest(models[0]) if any(p.setting.billboards < 1 for p in result.points) else None
+    truth = shots[0].truth.shape[-1], shots[0].truth.shape[-2]
     record = run_record(
         "tradeoff", config={"sheet": to_mapping(sheet), "protocol": to_mapping(protocol)}, inputs=inputs, device=label
     )
-    _write_results(args, sheet, result, importance, models[0].digest, label, size, len(shots), record)
+    _write_results(args, sheet, result, importance, models[0].digest, label, size, truth, len(shots), record)
     state = "complete" if result.complete else "stopped early, the same command goes on"
     print(f"{out}: {counts[True]} points measured, {counts[False]} remembered; {state}")
     return 0
@@ -173,7 +176,7 @@ def _sweep(
 
 def _write_results(
     args: argparse.Namespace, sheet: TradeoffConfig, result: Any, importance: list[float] | None, digest: str,
-    device: str, size: tuple[int, int], images: int, record: dict[str, Any],
+    device: str, size: tuple[int, int], truth: tuple[int, int], images: int, record: dict[str, Any],
 ) -> None:  # fmt: skip
     from nbavatar.io.atomic import atomic_write
     from nbavatar.reporting.figures import save_figure
@@ -188,8 +191,8 @@ def _write_results(
     presets = {name: steady[id(point)] for name, point in result.presets.items()}
     exact, own = points[0], [point for point in points if point.model == points[0].model]
     caption = f"{device}; {size[0]}x{size[1]} px, {images} held-out images"
-    if args.enlarge > 1:
-        caption += f" of {size[0] // args.enlarge}x{size[1] // args.enlarge} px"
+    if size != truth:
+        caption += f" of {truth[0]}x{truth[1]} px"
     if not result.complete:
         caption += "; sweep stopped early"
     rows = point_rows(points, presets, device)
@@ -209,8 +212,9 @@ def _write_results(
     for place in places:
         store_presets(place, model=digest, device=device, size=size, presets=entries, points=own, importance=importance)
     summary = {
-        "kind": "tradeoff", "format": 1, "device": device, "size": list(size), "enlarge": args.enlarge, "images": images,
-        "complete": result.complete, "presets": entries, "paragraphs": paragraphs, "points": rows, "record": record,
+        "kind": "tradeoff", "format": 1, "device": device, "size": list(size), "frames": list(truth),
+        "images": images, "complete": result.complete, "presets": entries, "paragraphs": paragraphs, "points": rows,
+        "record": record,
     }  # fmt: skip
     write_json(out / "tradeoff.json", summary)
     for name, entry in entries.items():
@@ -248,11 +252,12 @@ def _shots(
             expected, found = f"{size[0]}x{size[1]} as the first camera", f"{view.width}x{view.height}"
             raise DataError.of(packs[view.pack].path, "size", expected=expected, found=found)
     truths = [(packs[view.pack].read("rgb", view.frame), packs[view.pack].read("alpha", view.frame)) for view in chosen]
+    times = max(1, math.ceil(args.side / max(size)))
     shots = prepare_shots(
-        sequence, parts, chosen, truths, protocol.background, net, refined=protocol.refined, enlarge=args.enlarge,
+        sequence, parts, chosen, truths, protocol.background, net, refined=protocol.refined, enlarge=times,
         device=device,
     )  # fmt: skip
-    return shots, (args.enlarge * size[0], args.enlarge * size[1])
+    return shots, (times * size[0], times * size[1])
 
 
 class _Chooser:

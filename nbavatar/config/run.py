@@ -57,6 +57,14 @@ class TradeoffRun:
     sheet: str = option("config/tradeoff.yaml", "Knobs and values.")
     variants: list[str] = option([], "Variants to sweep, for the first subject that has them; none by default.")
     protocol: str = option("nv1024", "Protocol whose images judge quality.")
+    side: int = option(
+        0, "Longer side that pictures have at least: rendered a whole number of times as large as the images [px].",
+        min=0, max=8192,
+    )  # fmt: skip
+    also: list[str] = option(
+        [], "What is measured besides: every saving on and off, the stages before training.",
+        choices=("savings", "offline"),
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)

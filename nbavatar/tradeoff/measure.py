@@ -141,10 +141,10 @@ def measure_point(
 
     Returns:
         JSON-ready: `psnr` and `psnr_fg` [dB], `ssim`, `lpips`; `diff_max` [1] and `diff_share` (of the pixels that
-        differ by more than 1/255 in a channel), `psnr_apart` [dB] and `lpips_apart` against the exact setting's pictures
-        at full size; `ms` by stage and `total` (medians),
-        `exact_ms` (median of the paired exact pictures), `speedup`; `peak_memory_mb` (tensors of the avatar and what
-        a picture needs besides); `model_mb`; `work` a picture.
+        differ by more than 1/255 in a channel), `psnr_apart` [dB] and `lpips_apart` against the exact setting's
+        pictures at full size; `ms` by stage and `total` (medians), `exact_ms` (median of the paired exact pictures),
+        `speedup`; `peak_memory_mb` (tensors of the avatar and what a picture needs besides); `model_mb`; `work` a
+        picture.
     """
     rows, apart = [], []
     before = asdict(avatar.work)

@@ -70,7 +70,8 @@ def measure_savings(
     Returns:
         One row a switch: `saving`, `scene`, `on_ms`, `off_ms`, `faster` (median ratio of paired pictures), memory and
         bytes on and off, largest difference, share of the pixels that differ by more than 1/255 and LPIPS between
-        the two, change of PSNR and LPIPS against the truth where there is one (else None), and the work counted, on and off.
+        the two, change of PSNR and LPIPS against the truth where there is one (else None), and the work counted, on and
+        off.
     """
     rows = []
     for switch in _switches(avatar, shots, importance):

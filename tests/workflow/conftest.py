@@ -16,7 +16,8 @@ verb=$1
 make() { mkdir -p "$(dirname "$1")"; echo made > "$1"; }
 while [ $# -gt 0 ]; do
   case "$verb $1" in
-    "tradeoff --out") for f in tradeoff.json points.csv presets.json front_ms.png front_memory.png front_bytes.png
+    "tradeoff --out") for f in tradeoff.json points.csv presets.json front_ms.png front_memory.png front_bytes.png \
+      savings.json savings.csv savings.md offline.json offline.csv offline.md offline.png
       do make "$2/$f"; done ;;
     "extremes --out") for f in table.md table.csv heatmap.png curves.png record.json; do make "$2/$f"; done ;;
     "video --out") make "$2"; make "$2.json" ;;

@@ -62,7 +62,8 @@ def test_the_whole_paper_is_planned(project):
     assert plan == {
         "ingest": 32, "tracks": 4, "masks": 32, "crop": 64, "fit": 4, "spectral": 4, "deform": 4,
         "train": 28, "render": 48, "evaluate": 48, "speed": 7, "table": 8, "report": 1,
-        "figure": 10, "reenact": 4, "reenact_contact": 4, "video": 8, "tradeoff": 1, "extremes": 1,
+        "figure": 10, "reenact": 4, "reenact_contact": 4, "video": 8, "tradeoff": 1, "savings": 1, "offline": 1,
+        "extremes": 1,
     }  # fmt: skip
 
 

@@ -348,20 +348,29 @@ def videos():
     ]
 
 
-def tradeoffs():
+def tradeoffs(variants, also):
+    """Sweeps of some variants, each for the first subject that has it, and what is measured besides."""
     first = {}
     for subject, variant in avatars():
-        if variant in RUN.tradeoff.variants:
+        if variant in variants:
             first.setdefault(variant, subject)
-    return [
-        f"{R}/tradeoff/{subject}/{variant}/tradeoff.json"
-        for variant, subject in first.items()
+    kinds = ["tradeoff", *(["savings"] if "savings" in also else [])]
+    files = [
+        f"{R}/tradeoff/{s}/{v}/{kind}.json" for v, s in first.items() for kind in kinds
     ]
+    offline = [
+        f"{R}/tradeoff/{subject}/offline/offline.json"
+        for subject in dict.fromkeys(first.values())
+    ]
+    return files + (offline if "offline" in also else [])
+
+
+TRADEOFFS = tradeoffs(RUN.tradeoff.variants, RUN.tradeoff.also)
 
 
 EVERYTHING = [
     *videos(),
-    *tradeoffs(),
+    *TRADEOFFS,
     *([f"{R}/extremes/table.md"] if RUN.extremes else []),
     *(f"{R}/figures/{figure}.png" for figure in FIGURES),
     *evals_of(ROWS),

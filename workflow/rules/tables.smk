@@ -51,7 +51,7 @@ rule report:
         histories=[f"{R}/train/{s}/{v}/history.jsonl" for s, v in avatars()],
         pictures=report_pictures(),
         videos=videos(),
-        tradeoffs=tradeoffs(),
+        tradeoffs=TRADEOFFS,
         extremes=[f"{R}/extremes/record.json"] if RUN.extremes else [],
     output:
         report(

@@ -18,6 +18,10 @@ def stage_files(stage):
         "render": renders_of(ROWS),
         "evaluate": evals_of(ROWS),
         "speed": sorted({path for table in TABLES for path in speeds_of(table)}),
+        # The whole of it, also where the run itself sweeps nothing.
+        "tradeoff": tradeoffs(
+            RUN.tradeoff.variants or list(RUN.variants)[:1], ("savings", "offline")
+        ),
     }
     if RUN.layout == "decaf":
         files["fit"] = [f"{R}/fit/{s}.npz" for s in subjects]
@@ -54,6 +58,7 @@ for _stage in (
     "render",
     "evaluate",
     "speed",
+    "tradeoff",
 ):
 
     rule:

@@ -1,7 +1,7 @@
 """Speed against accuracy of an avatar, and every kernel at its limits.
 
 REQUIRED INPUTS: results/{run}/train/{subject}/{variant}/model.pt, crops, meshes, the sheet of knobs
-OUTPUTS: results/{run}/tradeoff/{subject}/{variant}/..., results/{run}/extremes/...
+OUTPUTS: results/{run}/tradeoff/{subject}/{variant}/..., results/{run}/tradeoff/{subject}/offline/offline..., results/{run}/extremes/...
 """
 
 
@@ -37,11 +37,71 @@ rule tradeoff:
         device=RUN.device,
         folder=lambda w, output: Path(output.result).parent,
         protocol=lambda w: protocol_text(RUN.tradeoff.protocol),
+        side=RUN.tradeoff.side,
         code=code_digest("tradeoff"),
     shell:
         "nbavatar tradeoff --model {input.model} --meshes {input.meshes} --frames {input.frames}"
-        " --train-frames {input.train} --protocol {params.protocol:q} --sheet {input.sheet} --out {params.folder}"
-        " --no-store --device {params.device} > {log} 2>&1"
+        " --train-frames {input.train} --protocol {params.protocol:q} --sheet {input.sheet} --side {params.side}"
+        " --out {params.folder} --no-store --device {params.device} > {log} 2>&1"
+
+
+# Every switch of "only what a scene requires", on and off.
+rule savings:
+    input:
+        model="results/{run}/train/{subject}/{variant}/model.pt",
+        meshes=meshes_of,
+        frames=lambda w: frames_under(RUN.tradeoff.protocol, w.subject),
+        train=train_frames,
+        sheet=RUN.tradeoff.sheet,
+    output:
+        result="results/{run}/tradeoff/{subject}/{variant}/savings.json",
+        rows="results/{run}/tradeoff/{subject}/{variant}/savings.csv",
+        table="results/{run}/tradeoff/{subject}/{variant}/savings.md",
+    log:
+        "logs/{run}/tradeoff/{subject}/{variant}.savings.log",
+    threads: workflow.resource_settings.cores or 4
+    resources:
+        gpu=1,
+        mem="16GB",
+        runtime="2h",
+    params:
+        device=RUN.device,
+        folder=lambda w, output: Path(output.result).parent,
+        protocol=lambda w: protocol_text(RUN.tradeoff.protocol),
+        side=RUN.tradeoff.side,
+        code=code_digest("tradeoff"),
+    shell:
+        "nbavatar tradeoff --savings --model {input.model} --meshes {input.meshes} --frames {input.frames}"
+        " --train-frames {input.train} --protocol {params.protocol:q} --sheet {input.sheet} --side {params.side}"
+        " --out {params.folder} --device {params.device} > {log} 2>&1"
+
+
+# The stages before training: what their knobs cost in time, and in millimetres.
+rule offline:
+    input:
+        meshes=fitted,
+        sheet=RUN.tradeoff.sheet,
+    output:
+        result="results/{run}/tradeoff/{subject}/offline/offline.json",
+        rows="results/{run}/tradeoff/{subject}/offline/offline.csv",
+        table="results/{run}/tradeoff/{subject}/offline/offline.md",
+        plot=report(
+            "results/{run}/tradeoff/{subject}/offline/offline.png",
+            category="Speed against accuracy",
+            caption="../report/tradeoff.rst",
+        ),
+    log:
+        "logs/{run}/tradeoff/{subject}.offline.log",
+    threads: workflow.resource_settings.cores or 4
+    resources:
+        mem="16GB",
+        runtime="4h",
+    params:
+        folder=lambda w, output: Path(output.result).parent,
+        code=code_digest("tradeoff"),
+    shell:
+        "nbavatar tradeoff --offline --meshes {input.meshes} --sheet {input.sheet} --out {params.folder}"
+        " > {log} 2>&1"
 
 
 rule extremes:
