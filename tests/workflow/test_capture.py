@@ -1,0 +1,76 @@
+"""A capture of one's own through the whole workflow: folder in, avatar, metrics, tables, figures and report out."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.scenes.toy import SIZE, camera, draw, sequence
+
+ROOT = Path(__file__).parents[2]
+# Sizes and steps of a toy; every other setting is the one that users get.
+TINY = {
+    "crops": {"full": {"size": 32}},
+    "stages": {
+        "train": {"steps": 12, "texels": 4, "lpips_crop": 32, "previews": 1, "unet": {"width": 4, "max_width": 8}},
+        "speed": {"repeats": 1, "warmup": 0},
+        "video": {"seconds": 0.1, "max_frames": 2},
+    },
+}
+
+pytestmark = pytest.mark.slow
+
+
+def write_capture(root: Path) -> Path:
+    """The toy scene in the layout of a capture: label masks, a hand that is missing in one frame, no alpha."""
+    meshes = sequence()
+    K = np.array([[SIZE * 1.5, 0, SIZE / 2 - 1.3], [0, SIZE * 1.5, SIZE / 2 + 0.7], [0, 0, 1]])
+    cameras = {}
+    for index in range(3):
+        name, view = f"c{index}", camera(index)
+        cameras[name] = {
+            "width": SIZE, "height": SIZE, "K": K.tolist(), "R": view[:3, :3].tolist(), "t": view[:3, 3].tolist(),
+        }  # fmt: skip
+        for kind in ("images", "masks"):
+            (root / kind / name).mkdir(parents=True)
+        for row, frame in enumerate(meshes.frames):
+            rgb, _, label = draw(meshes, row, view, K, SIZE)
+            Image.fromarray(rgb).save(root / "images" / name / f"{frame}.png")
+            Image.fromarray(label).save(root / "masks" / name / f"{frame}.png")
+    (root / "cameras.json").write_text(json.dumps(cameras))
+    (root / "splits.json").write_text(json.dumps({"frames": meshes.frames}))
+    (root / "meshes").mkdir()
+    topology = {f"{part}_faces": value.faces for part, value in meshes.parts.items()}
+    np.savez(root / "meshes/topology.npz", **topology)
+    for row, frame in enumerate(meshes.frames):
+        there = [part for part in meshes.parts if not (row == 0 and part == "right_hand")]
+        np.savez(root / "meshes" / f"{frame}.npz", **{part: meshes.parts[part].verts[row] for part in there})
+    return root
+
+
+def test_a_capture_ends_in_tables_and_a_report(tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    project.mkdir()
+    for name in ("Snakefile", "workflow", "config", "nbavatar"):
+        (project / name).symlink_to(ROOT / name)
+    (tmp_path / "tiny.json").write_text(json.dumps(TINY))
+    environment = {**os.environ, "PYTHONPATH": str(project), "OMP_NUM_THREADS": "1"}
+    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
+    command = [
+        sys.executable, "-m", "nbavatar", "warm", "--", "snakemake", "--cores", "2",
+        "--configfile", "config/capture.yaml", str(tmp_path / "tiny.json"),
+        "--config", f"data_root={write_capture(tmp_path / 'toy')}",
+    ]  # fmt: skip
+    done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+    results = project / "results/capture"
+    scores = [json.loads((results / f"eval/toy/full/{name}.json").read_text()) for name in ("nv", "sr")]
+    assert all(np.isfinite(list(score["metrics"].values())).all() for score in scores)
+    for table in ("novel_view", "self_reenactment", "speed"):
+        assert "toy" in (results / f"tables/{table}.csv").read_text() or table == "speed"
+    assert "toy" in (results / "report/index.html").read_text()
