@@ -10,7 +10,8 @@
     --pictures   further pictures (.png): of the refit and the contact stage, and results of `nbavatar figure`, whose
                  titles and captions (.json beside them) are shown
     --videos     results of `nbavatar video` (.mp4): played in the page up to `video_mb`, linked beyond
-    --tradeoffs  results of `nbavatar tradeoff` (tradeoff.json), their tables and plots beside them
+    --tradeoffs  results of `nbavatar tradeoff` (tradeoff.json, and savings.json and offline.json of `--savings` and
+                 `--offline`), their tables and plots beside them
     --extremes   result of `nbavatar extremes` (record.json), its table and heat map beside it
     --out        index.html; needs no network and no other file
 
@@ -46,7 +47,7 @@ from nbavatar.reporting.page import (
     videos_section,
 )
 from nbavatar.reporting.pictures import data_uri, reduce_picture
-from nbavatar.tradeoff.section import tradeoff_section
+from nbavatar.tradeoff.section import offline_section, savings_section, tradeoff_section
 
 __all__ = ["add_arguments", "main", "read_histories", "read_renders"]
 
@@ -124,10 +125,17 @@ def _tables(paths: list[str]) -> dict[str, tuple[str, str]]:
 
 
 def _as_markdown(title: str, table: str) -> str:
-    """A table of numbers without a layout of its own, in at most four digits; the csv has all of them."""
+    """A table of numbers without a layout of its own, in at most four digits; the csv has all of them.
+
+    The first column, `group`, becomes a heading wherever it changes.
+    """
     head, *rows = ([_short(cell).replace("|", "\\|") for cell in row] for row in csv.reader(table.splitlines()))
-    lines = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
-    return "\n".join((f"## {title}", "", *lines))
+    lines = [head[1:], ["---"] * (len(head) - 1)]
+    for i, (group, *cells) in enumerate(rows):
+        if i == 0 or group != rows[i - 1][0]:
+            lines.append([f"*{group.replace('.', ': ').replace('_', ' ')}*", *[""] * (len(cells) - 1)])
+        lines.append([cells[0].replace("_", " "), *(cell or "none" for cell in cells[1:])])
+    return "\n".join((f"## {title}", "", *(f"| {' | '.join(row)} |" for row in lines)))
 
 
 def _short(cell: str) -> str:
@@ -188,11 +196,27 @@ def _training(paths: list[str], histories: dict[str, list[dict[str, Any]]], cfg:
     return curves_section(histories) + shown
 
 
+# Kind of a result of `nbavatar tradeoff` -> what is said of it, and the table beside it.
+_SWEEPS = {
+    "tradeoff": (tradeoff_section, "points.md"),
+    "savings": (savings_section, "savings.md"),
+    "offline": (offline_section, "offline.md"),
+}
+
+
 def _sweep(path: Path, cfg: ReportConfig) -> str:
-    section = tradeoff_section(read_json(path), _text(path.with_name("points.md")))
+    result = read_json(path)
+    kind = result.get("kind") if isinstance(result, dict) else None
+    if kind not in _SWEEPS:
+        raise DataError.of(path, "kind", expected=f"one of {', '.join(_SWEEPS)}", found=repr(kind))
+    tell, table = _SWEEPS[kind]
+    section = tell(result, _text(path.with_name(table)))
     named = [(caption, _embedded(path.with_name(name), cfg), caption) for name, caption in section.figures]
-    rows = f"<details><summary>All points</summary>{markdown_to_html(section.table)}</details>"
-    title = " ".join(path.parts[-3:-1])
+    rows = markdown_to_html(section.table)
+    if kind == "tradeoff":
+        rows = f"<details><summary>All points</summary>{rows}</details>"
+    # The stages before training belong to a subject, not to one of its avatars.
+    title = f"{section.title}: {' '.join(path.parts[-3:-2] if kind == 'offline' else path.parts[-3:-1])}"
     return "\n".join(
         (markdown_to_html("\n\n".join([f"## {title}", *section.paragraphs])), pictures_section(named), rows)
     )

@@ -6,7 +6,7 @@
     --reported   config/reported.csv: every number the paper prints
     --evals      results of `nbavatar evaluate` (.json); those of other rows are ignored, missing ones show as missing
     --speeds     results of `nbavatar speed` (.json)
-    --out-stem   STEM.csv (one line a cell, with its source), STEM.md and STEM.tex are written
+    --out-stem   STEM.csv (one line a cell, with its source), STEM.md, STEM.tex and STEM.html (to look at) are written
 
 Results of another image size than the paper's, and all of them with --size-label, stand under a heading that says so.
 """
@@ -24,6 +24,8 @@ from nbavatar.io.records import read_json
 from nbavatar.provenance import file_digest, run_record
 from nbavatar.reporting.cells import Source, Table
 from nbavatar.reporting.formats import to_csv, to_latex, to_markdown
+from nbavatar.reporting.markdown import markdown_to_html
+from nbavatar.reporting.page import page
 from nbavatar.reporting.printed import read_printed
 from nbavatar.reporting.tables import Result, build_table, index_results
 
@@ -43,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Writes one table in three formats and prints it."""
+    """Writes one table in four formats."""
     cfg = stage_config(args, TableConfig)
     layout = choose_table(read_tables(args.layout), args.table, args.layout)
     files = [*args.evals, *args.speeds]
@@ -59,9 +61,12 @@ def main(args: argparse.Namespace) -> int:
     )
     record = run_record("table", config={"table": args.table} | to_mapping(cfg), inputs=inputs)
     table = Table(**{**vars(table), "record": record})
-    for suffix, write in (("csv", to_csv), ("md", to_markdown), ("tex", to_latex)):
+    texts = {"csv": to_csv(table), "md": to_markdown(table), "tex": to_latex(table)}
+    shown = markdown_to_html(texts["md"].partition("\n")[2])  # the page has the title
+    texts["html"] = page(table.title, args.size_label, [("table", args.table, shown)])
+    for suffix, text in texts.items():
         with atomic_write(f"{args.out_stem}.{suffix}") as path:
-            path.write_text(write(table), encoding="utf-8")
+            path.write_text(text, encoding="utf-8")
     print(f"{args.out_stem}.md written")
     return 0
 

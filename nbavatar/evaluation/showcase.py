@@ -96,7 +96,7 @@ def show_reenactment(
         for number, picture in enumerate(pictures):
             frame = picture.view.frame
             driver = _truth(other, frame) if other is not None and frame in other.frames else None
-            subject = _truth(own, own.frames[len(own.frames) // 2]) if number == 0 else None
+            subject = _truth(own, own.frames[int((2 * number + 1) * len(own.frames) / (2 * len(chosen)))])
             rows.append((f"{source} by {target}", [subject, driver, picture.rgb]))
             shown.append(f"{source} by {target} {picture.view.camera}/{frame}")
     return ["subject", "driver", "driven"], rows, shown

@@ -170,9 +170,13 @@ def to_strip(comparison: Comparison, *, max_side: int) -> Strip:
 
 def _figures(metrics: Mapping[str, Any]) -> str:
     """The figures of one image as a short line."""
-    shown = (("psnr", "PSNR", 2), ("ssim", "SSIM", 3), ("lpips_vgg", "LPIPS", 3))
-    words = [f"{word} {metrics[key]:.{digits}f}" for key, word, digits in shown if metrics.get(key) is not None]
-    return ", ".join(words)
+    shown = (
+        ("psnr", "PSNR {:.2f} dB"),
+        ("ssim", "SSIM {:.3f}"),
+        ("lpips_vgg", "LPIPS {:.3f} (VGG)"),
+        ("lpips_alex", "LPIPS {:.3f} (AlexNet)"),
+    )
+    return ", ".join(words.format(metrics[key]) for key, words in shown if metrics.get(key) is not None)
 
 
 def _composite(rgb: np.ndarray, alpha: np.ndarray, background: Sequence[float]) -> np.ndarray:

@@ -70,8 +70,10 @@ def grid_figure(columns: Sequence[str], rows: Sequence[GridRow], *, bar: tuple[s
     axes.axis("off")
     for number, heading in enumerate(columns):
         x = _LEFT + number * (_CELL + _GAP) + _CELL / 2
-        text = "\n".join(textwrap.wrap(heading, 20)[:2])
-        axes.text(x, _RIM + _TOP - 0.05, text, ha="center", va="bottom", fontsize=8, linespacing=0.95)
+        lines = textwrap.wrap(heading, 20)[:2]
+        # By line from the baseline: a descender in one heading would lift it above the others.
+        for up, line in enumerate(reversed(lines)):
+            axes.text(x, _RIM + _TOP - 0.08 - 0.115 * up, line, ha="center", va="baseline", fontsize=8)
     for row, top, height in zip(rows, tops, heights, strict=True):
         axes.text(_LEFT - 0.08, top + height / 2, row.name, rotation=90, ha="right", va="center", fontsize=8)
         for number, picture in enumerate(row.pictures):

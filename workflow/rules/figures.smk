@@ -57,6 +57,7 @@ rule video:
         video=report(
             "results/{run}/video/{subject}/{variant}/{kind}.mp4",
             category="Videos",
+            labels={"subject": "{subject}", "variant": "{variant}", "video": "{kind}"},
             caption="../report/video.rst",
         ),
         record="results/{run}/video/{subject}/{variant}/{kind}.mp4.json",
@@ -91,6 +92,7 @@ rule figure:
         png=report(
             "results/{run}/figures/{figure}.png",
             category="Figures",
+            labels={"figure": "{figure}"},
             caption="../report/figure.rst",
         ),
         pdf="results/{run}/figures/{figure}.pdf",

@@ -21,6 +21,7 @@ if RUN.layout == "decaf":
             sheet=report(
                 "results/{run}/fit/{subject}.png",
                 category="Geometry",
+                labels={"stage": "refit", "subject": "{subject}"},
                 caption="../report/fit.rst",
             ),
         log:
@@ -50,6 +51,7 @@ rule spectral:
         picture=report(
             "results/{run}/spectral/{subject}.png",
             category="Geometry",
+            labels={"stage": "spectral coordinates", "subject": "{subject}"},
             caption="../report/spectral.rst",
         ),
     log:
@@ -76,6 +78,7 @@ rule deform:
         picture=report(
             "results/{run}/deform/{subject}.png",
             category="Geometry",
+            labels={"stage": "contact", "subject": "{subject}"},
             caption="../report/deform.rst",
         ),
     log:

@@ -1,7 +1,7 @@
 """Tables and the report.
 
 REQUIRED INPUTS: results/{run}/eval/**, results/{run}/speed/**, config/tables.yaml, config/reported.csv
-OUTPUTS: results/{run}/tables/{table}.{csv,md,tex}, results/{run}/report/index.html
+OUTPUTS: results/{run}/tables/{table}.{csv,md,tex,html}, results/{run}/report/index.html
 """
 
 
@@ -14,12 +14,14 @@ rule table:
         speeds=lambda w: speeds_of(w.table),
     output:
         csv="results/{run}/tables/{table}.csv",
-        md=report(
-            "results/{run}/tables/{table}.md",
+        md="results/{run}/tables/{table}.md",
+        tex="results/{run}/tables/{table}.tex",
+        html=report(
+            "results/{run}/tables/{table}.html",
             category="Tables",
+            labels={"table": "{table}"},
             caption="../report/table.rst",
         ),
-        tex="results/{run}/tables/{table}.tex",
     log:
         "logs/{run}/table/{table}.log",
     resources:
@@ -57,6 +59,7 @@ rule report:
         report(
             "results/{run}/report/index.html",
             category="Report",
+            labels={"page": "everything on one page"},
             caption="../report/page.rst",
         ),
     log:

@@ -18,14 +18,18 @@ rule tradeoff:
         result="results/{run}/tradeoff/{subject}/{variant}/tradeoff.json",
         points="results/{run}/tradeoff/{subject}/{variant}/points.csv",
         presets="results/{run}/tradeoff/{subject}/{variant}/presets.json",
-        plots=report(
-            expand(
-                "results/{{run}}/tradeoff/{{subject}}/{{variant}}/front_{cost}.png",
-                cost=("ms", "memory", "bytes"),
-            ),
-            category="Speed against accuracy",
-            caption="../report/tradeoff.rst",
-        ),
+        plots=[
+            report(
+                f"results/{{run}}/tradeoff/{{subject}}/{{variant}}/front_{name}.png",
+                category="Speed against accuracy",
+                labels={
+                    "subject": "{subject}",
+                    "shown": f"{{variant}}: quality against {cost}",
+                },
+                caption="../report/tradeoff.rst",
+            )
+            for name, cost in (("ms", "time"), ("memory", "memory"), ("bytes", "size"))
+        ],
     log:
         "logs/{run}/tradeoff/{subject}/{variant}.log",
     threads: workflow.resource_settings.cores or 4
@@ -88,6 +92,7 @@ rule offline:
         plot=report(
             "results/{run}/tradeoff/{subject}/offline/offline.png",
             category="Speed against accuracy",
+            labels={"subject": "{subject}", "shown": "stages before training"},
             caption="../report/tradeoff.rst",
         ),
     log:
@@ -106,18 +111,20 @@ rule offline:
 
 rule extremes:
     output:
-        table=report(
-            "results/{run}/extremes/table.md",
-            category="Extremes",
-            caption="../report/extremes.rst",
-        ),
+        table="results/{run}/extremes/table.md",
         rows="results/{run}/extremes/table.csv",
         heatmap=report(
             "results/{run}/extremes/heatmap.png",
             category="Extremes",
+            labels={"shown": "verdicts"},
             caption="../report/extremes.rst",
         ),
-        curves="results/{run}/extremes/curves.png",
+        curves=report(
+            "results/{run}/extremes/curves.png",
+            category="Extremes",
+            labels={"shown": "errors by level"},
+            caption="../report/extremes.rst",
+        ),
         record="results/{run}/extremes/record.json",
     log:
         "logs/{run}/extremes.log",

@@ -105,3 +105,46 @@ def test_render_refuses_meshes_of_another_topology(trained, tmp_path, capsys) ->
 def test_render_refuses_an_unknown_split(trained, tmp_path, capsys) -> None:
     assert render(trained, tmp_path / "x.zip", trained["packs"][2:], {"split": "nv"}) == 2
     assert "expected one of novel_view" in capsys.readouterr().err
+
+
+def test_an_avatar_driven_by_another_subject_is_rendered_in_that_ones_poses_with_its_own_shape(
+    trained, tmp_path
+) -> None:
+    """The other one is a quarter larger, turns both parts by known angles, and has frames and crops of its own."""
+    own, _ = read_sequence(trained["meshes"])
+    turns = [np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]) for a in (0.2, 0.5, 0.9)]
+    moves = np.array([[0.03, 0.0, 0.0], [0.0, 0.04, 0.0], [-0.05, 0.0, 0.02]])
+    names = ["a0", "a1", "a2"]
+
+    def posed(rest: np.ndarray, centres: np.ndarray) -> np.ndarray:
+        local = rest - rest.mean(0)
+        return np.stack([local @ turn.T + c for turn, c in zip(turns, centres, strict=True)]).astype(np.float32)
+
+    parts = {
+        name: Part(part.faces, 1.25 * part.rest, posed(1.25 * part.rest, 1.25 * part.rest.mean(0) + moves))
+        for name, part in own.parts.items()
+    }
+    scene = write_scene(tmp_path / "other", meshes=MeshSequence(names, parts, {}))
+    driven = tmp_path / "driven.npz"
+    arguments = ["--source", trained["meshes"], "--target", str(scene["meshes"]), "--place", "target", "--free-hands"]
+    assert main(["reenact", *arguments, "--out", str(driven)]) == 0
+    found, _ = read_sequence(driven)
+    packs = [str(scene["packs"][1])]
+    assert render(trained, tmp_path / "driven.zip", packs, {"split": "all"}, str(driven)) == 0
+
+    # What the pictures should show: the avatar's own rest shape under the other one's motion.
+    expected = {}
+    for name, part in own.parts.items():
+        np.testing.assert_allclose(found.parts[name].verts.mean(1), parts[name].verts.mean(1), atol=1e-5)
+        expected[name] = Part(part.faces, part.rest, posed(part.rest, parts[name].verts.mean(1)))
+    write_sequence(tmp_path / "expected.npz", MeshSequence(names, expected, {"driver": np.array(names)}), {})
+    assert render(trained, tmp_path / "expected.zip", packs, {"split": "all"}, str(tmp_path / "expected.npz")) == 0
+    with FramePack(tmp_path / "driven.zip") as one, FramePack(tmp_path / "expected.zip") as other:
+        assert one.frames == [f"cam1/{name}" for name in names]
+        pictures = [one.read("rgb", name).astype(int) for name in one.frames]
+        masks = [one.read("nb_alpha", name) for name in one.frames]
+        for name, picture in zip(one.frames, pictures, strict=True):
+            # Vertices agree to a few micrometres, which moves a value by a level at most.
+            assert np.abs(picture - other.read("rgb", name)).max() <= 1
+    assert all(mask.max() > 200 and mask.min() == 0 for mask in masks)
+    assert np.abs(masks[0].astype(int) - masks[2]).max() > 100

@@ -132,7 +132,7 @@ def test_page_shows_truth_renders_errors_masks_and_figures(run):
     text = build(*run, "--cfg", '{"frames": 2}')
     for words in (
         "Ground truth (camera 102, frame 0000)", "no_nb (camera 102, frame 0005)", "zoom into full (camera 102",
-        "error map of full (camera 102", "coverage of full (camera 102", "PSNR 20.50, SSIM 0.900, LPIPS 0.100",
+        "error map of full (camera 102", "coverage of full (camera 102", "PSNR 20.50 dB, SSIM 0.900, LPIPS 0.100 (VGG)",
         "PSNR on the training view", "PSNR [dB]", "Training preview of S2/full", "abcdef012345", "ablation.csv",
     ):  # fmt: skip
         assert words in text, words
@@ -149,12 +149,41 @@ def test_every_part_may_be_missing(run):
     Page(build(folder, {}))
 
 
-def test_a_table_of_numbers_is_shown_as_it_is(tmp_path):
+def test_a_table_of_numbers_is_shown_by_group(tmp_path):
     (tmp_path / "deform").mkdir()
-    (tmp_path / "deform/S2.csv").write_text("group,quantity,value\nbefore,depth_mm,5.9\nafter,depth_mm,0.04\n")
+    rows = ("group,quantity,value", "a.before,depth_mm,5.912345", "a.before,frames,", "after,depth_mm,0.04")
+    (tmp_path / "deform/S2.csv").write_text("\n".join(rows))
     text = build(tmp_path, {"--tables": [str(tmp_path / "deform/S2.csv")]})
-    assert "deform S2" in text
-    assert '<th scope="row">after</th><td>depth_mm</td><td>0.04</td>' in text
+    Page(text)
+    assert "deform S2" in text and '<th scope="col">quantity</th><th scope="col">value</th>' in text
+    heads = re.findall(r'<tr class="block"><th colspan="2" scope="rowgroup"><span><i>(.*?)</i>', text)
+    assert heads == ["a: before", "after"]
+    cells = re.findall(r'<tr><th scope="row">(.*?)</th><td>(.*?)</td></tr>', text)
+    assert cells == [("depth mm", "5.912"), ("frames", "none"), ("depth mm", "0.04")]
+
+
+def test_savings_and_stages_before_training_stand_beside_the_sweep(tmp_path, capsys):
+    table = "| saving | faster |\n|---|---:|\n| region of interest | 3.1x |\n"
+    saving = {"saving": "region of interest", "scene": "an avatar far away", "faster": 3.1}
+    step = {"stage": "refit", "knob": "cameras", "value": 4, "error_mm": 0.7, "ms": 12.0, "meaning": "median distance"}
+    for place, kind, row in (("S2/full", "savings", saving), ("S2/offline", "offline", step)):
+        folder = tmp_path / "tradeoff" / place
+        folder.mkdir(parents=True)
+        (folder / f"{kind}.json").write_text(json.dumps({"kind": kind, "rows": [row]}))
+        (folder / f"{kind}.md").write_text(table)
+    (folder / "offline.png").write_bytes(encode_png(np.full((9, 9, 3), 200, np.uint8)))
+    files = [str(tmp_path / "tradeoff/S2" / name) for name in ("full/savings.json", "offline/offline.json")]
+    text = build(tmp_path, {"--tradeoffs": files})
+    page = Page(text)
+    for words in (
+        "Only what a scene requires: S2 full", "(an avatar far away), 3.1x", "Stages before training: S2</h3>",
+        "Refit, cameras (median distance): 4: 0.70 mm in 12 ms.", "<td>3.1x</td>",
+    ):  # fmt: skip
+        assert words in text, words
+    assert len(page.all("img")) == 1 and page.all("table") and not page.all("details")
+    (tmp_path / "other.json").write_text('{"kind": "figure"}')
+    assert main(["report", "--tradeoffs", str(tmp_path / "other.json"), "--out", str(tmp_path / "i.html")]) == 2
+    assert "one of tradeoff, savings, offline" in capsys.readouterr().err
 
 
 def test_quality_against_cost_figures_and_videos(run):

@@ -52,6 +52,7 @@ def make(folder, table, evals=(), speeds=(), *extra, layout=LAYOUT):
     assert code == 0
     with open(f"{stem}.csv", newline="") as stream:
         cells = {(r["panel"], r["block"], r["row"], r["column"]): r for r in csv.DictReader(stream)}
+    assert "<title>" in Path(f"{stem}.html").read_text()
     return cells, Path(f"{stem}.md").read_text(), Path(f"{stem}.tex").read_text()
 
 
