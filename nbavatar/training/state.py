@@ -4,17 +4,19 @@
     events.jsonl    one line per logged step
     tensorboard/    the same numbers and the previews as event files
     key.json        what the state belongs to: configuration, code and inputs
+    lock            held while a training writes here; the system frees it however the training ends
     previews/       pictures, named by step
 
 A folder whose key differs belongs to another experiment; it is moved aside, never mixed and never deleted.
 """
 
+import fcntl
 import json
 import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -34,6 +36,9 @@ class RunFolder:
     Args:
         path: the folder; made when missing.
         key: JSON-ready description of the experiment.
+
+    Raises:
+        DataError: another process trains in this folder.
     """
 
     def __init__(self, path: str | os.PathLike[str], key: Mapping[str, Any]) -> None:
@@ -42,7 +47,8 @@ class RunFolder:
         self._curves: EventFile | None = None
         self._first = 0
         key_file = self.path / "key.json"
-        if self.path.exists() and not self._belongs(key_file, key):
+        self._lock = self._claim()
+        if not self._belongs(key_file, key):
             stamp = time.strftime("%Y%m%d-%H%M%S")
             for number in range(1000):
                 aside = self.path.with_name(f"{self.path.name}.stale-{stamp}" + (f"-{number}" if number else ""))
@@ -50,11 +56,24 @@ class RunFolder:
                     break
             os.replace(self.path, aside)
             self.moved_to = aside
-        (self.path / "previews").mkdir(parents=True, exist_ok=True)
+            self._lock = self._claim()
+        (self.path / "previews").mkdir(exist_ok=True)
         for leftover in self.path.glob(".*.tmp*"):  # of a run that was killed while writing
             leftover.unlink(missing_ok=True)
         if not key_file.exists():
             write_json(key_file, dict(key))
+
+    def _claim(self) -> IO[str]:
+        """The open lock of the folder, which is made when missing."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        lock = open(self.path / "lock", "a", encoding="utf-8")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            found, fix = "another training that writes to it", "wait for its end or stop it"
+            raise DataError.of(self.path, expected="a folder of its own", found=found, fix=fix) from None
+        return lock
 
     @staticmethod
     def _belongs(key_file: Path, key: Mapping[str, Any]) -> bool:

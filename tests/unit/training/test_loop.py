@@ -18,7 +18,7 @@ from nbavatar.config.avatar import TrainConfig, UNetConfig
 from nbavatar.config.core import to_mapping
 from nbavatar.data.sequences import MeshSequence, Part, read_sequence
 from nbavatar.data.views import ViewStore, views_of
-from nbavatar.errors import NBAvatarError
+from nbavatar.errors import DataError, NBAvatarError
 from nbavatar.io.framepack import FramePack
 from nbavatar.training.billboards import parameter_groups
 from nbavatar.training.loop import train
@@ -238,6 +238,16 @@ def test_state_of_another_experiment_is_moved_aside(tmp_path) -> None:
     assert (other.moved_to / "state.pt").exists()
 
 
+def test_two_trainings_never_share_a_folder(tmp_path) -> None:
+    first = RunFolder(tmp_path / "s", {"a": 1})
+    for key in ({"a": 1}, {"a": 2}):  # neither resumed nor moved aside while it is written to
+        with pytest.raises(DataError, match="another training that writes to it"):
+            RunFolder(tmp_path / "s", key)
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
+    del first
+    RunFolder(tmp_path / "s", {"a": 1})
+
+
 def test_events_after_the_checkpoint_and_torn_lines_are_dropped(tmp_path) -> None:
     folder = RunFolder(tmp_path / "s", {})
     for step in (1, 2, 3):
@@ -245,6 +255,7 @@ def test_events_after_the_checkpoint_and_torn_lines_are_dropped(tmp_path) -> Non
     folder.save({"step": 2})
     with open(tmp_path / "s" / "events.jsonl", "a") as stream:
         stream.write('{"step": 4, "mse"')
+    del folder  # the lock goes with it, as with a process that ends
     again = RunFolder(tmp_path / "s", {})
     again.load()
     assert [event["step"] for event in again.events()] == [1, 2]
