@@ -7,6 +7,8 @@ import sys
 import pytest
 import yaml
 
+from tests.scenes.capture import write_capture
+
 SMOKE = {
     "synthesize": 1, "ingest": 4, "tracks": 1, "masks": 4, "crop": 8, "fit": 1, "spectral": 1, "deform": 1,
     "train": 13, "render": 18, "evaluate": 18, "speed": 7, "table": 8, "report": 1,
@@ -107,6 +109,12 @@ def test_capture_without_a_folder_says_which_option_to_give(project):
     out = project.snakemake("-n", config="config/capture.yaml")
     assert out.returncode != 0
     assert "--config data_root=" in out.stdout + out.stderr
+
+
+def test_methods_are_laid_over_a_capture(project, tmp_path):
+    root = f"data_root={write_capture(tmp_path / 'toy')}"
+    jobs = project.plan("config/methods.yaml", "--config", root, config="config/capture.yaml")
+    assert jobs["train"] == 6 and jobs["evaluate"] == 9 and jobs["speed"] == 3 and jobs["table"] == 4
 
 
 def test_lint_is_clean(project):
