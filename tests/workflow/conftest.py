@@ -52,8 +52,8 @@ class Project:
         self.environment["PYTHONPATH"] = str(folder)
 
     def snakemake(self, *words: str, config: str = "config/smoke.yaml") -> subprocess.CompletedProcess[str]:
-        """Runs snakemake in the folder."""
-        command = [sys.executable, "-m", "snakemake", "--cores", "2", "--configfile", config, *words]
+        """Runs snakemake in the folder; configuration files are separated by spaces, later ones win."""
+        command = [sys.executable, "-m", "snakemake", "--cores", "2", "--configfile", *config.split(), *words]
         return subprocess.run(
             command, cwd=self.folder, env=self.environment, capture_output=True, text=True, timeout=300
         )

@@ -113,7 +113,7 @@ def test_capture_without_a_folder_says_which_option_to_give(project):
 
 def test_methods_are_laid_over_a_capture(project, tmp_path):
     root = f"data_root={write_capture(tmp_path / 'toy')}"
-    jobs = project.plan("config/methods.yaml", "--config", root, config="config/capture.yaml")
+    jobs = project.plan("--config", root, config="config/capture.yaml config/methods.yaml")
     assert jobs["train"] == 6 and jobs["evaluate"] == 9 and jobs["speed"] == 3 and jobs["table"] == 4
 
 
