@@ -37,7 +37,10 @@ class DeformingMesh:
         self.faces = faces
         self._count = len(verts)
         loops = boundary_loops(faces[~repeated])
-        self._rims = loops
+        # The vertices of all borders, where each begins, and their numbers.
+        self._rims = np.concatenate([*loops, np.zeros(0, np.int64)])
+        sizes = np.array([len(loop) for loop in loops], np.int64)
+        self._rim_starts, self._rim_sizes = np.cumsum(sizes) - sizes, sizes[:, None]
         fans = [
             np.stack((np.roll(loop, -1), loop, np.full(len(loop), len(verts) + i)), axis=1)
             for i, loop in enumerate(loops)
@@ -60,8 +63,7 @@ class DeformingMesh:
         self._around = np.argsort(flat, kind="stable")
         self._around_start = np.concatenate(([0], np.cumsum(np.bincount(flat, minlength=len(self.verts)))))
         self._rim = np.zeros(len(verts), bool)
-        for loop in loops:
-            self._rim[loop] = True
+        self._rim[self._rims] = True
         # Position of a face among the proper ones.
         self._place_of = np.zeros(len(faces), np.int64)
         self._place_of[self._proper] = np.arange(len(self._proper))
@@ -87,8 +89,9 @@ class DeformingMesh:
         distance, face, weight = nearest(
             points, self.verts, self._leaves, self._ids, self._true_faces, self._nodes, self._bounds, float(radius)
         )
-        found = face >= 0
-        face[found] = self._proper[face[found]]
+        if len(self._proper) < len(self.faces):
+            found = face >= 0
+            face[found] = self._proper[face[found]]
         return distance, face, weight
 
     def signed(self, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -178,8 +181,8 @@ class DeformingMesh:
 
     def _place(self, verts: np.ndarray) -> None:
         self.verts[: self._count] = verts
-        for i, rim in enumerate(self._rims):
-            self.verts[self._count + i] = self.verts[rim].mean(axis=0)
+        if len(self._rims):
+            self.verts[self._count :] = np.add.reduceat(self.verts[self._rims], self._rim_starts) / self._rim_sizes
 
     def _fit(self) -> None:
         if not self._fitted:

@@ -12,9 +12,10 @@ __all__ = ["draw_mesh", "look_from", "signed_colors", "vertex_normals"]
 def vertex_normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area-weighted unit normals, (V, 3) float64; 0 where a vertex has no face or its faces cancel."""
     verts = np.asarray(verts, np.float64)
-    cross = np.cross(verts[faces[:, 1]] - verts[faces[:, 0]], verts[faces[:, 2]] - verts[faces[:, 0]])
-    corners = faces.ravel()
-    normals = np.stack([np.bincount(corners, np.repeat(axis, 3), minlength=len(verts)) for axis in cross.T], axis=1)
+    a, b, c = (np.ascontiguousarray(verts[faces[:, k]].T) for k in range(3))
+    b, c, corners = b - a, c - a, faces.ravel()
+    cross = (b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0])
+    normals = np.stack([np.bincount(corners, np.repeat(axis, 3), minlength=len(verts)) for axis in cross], axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
 

@@ -1,11 +1,12 @@
 """Where hands and head touch or overlap, as contacts for the solver and as figures for the report."""
 
+import math
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
-from nbavatar.mesh.bvh import DeformingMesh, surface_points
+from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.mesh.tree import in_box
 
 __all__ = ["Contacts", "Overlap", "deepest_edge", "estimate_overlap", "find_contacts", "measure_overlap"]
@@ -183,7 +184,7 @@ def deepest_edge(head: DeformingMesh, hand: DeformingMesh, edges: tuple[np.ndarr
     for mesh, other, pairs in ((head, hand, edges[0]), (hand, head, edges[1])):
         ids, weights = _dips(mesh, other, pairs)
         if len(ids):
-            points = np.einsum("pc,pci->pi", weights, mesh.verts[ids])
+            points = _surface_points(mesh.verts, ids, weights)
             deepest = max(deepest, float(other.closest(points, np.inf)[0].max()))
     return deepest
 
@@ -214,12 +215,14 @@ def find_contacts(
     """
     parts: list[tuple[np.ndarray, ...]] = []
     for h, (hand, count) in enumerate(zip(hands, hand_counts, strict=True)):
-        anchor, share = _samples(hand, np.arange(count), None if edges is None else edges[1][h], head)
-        ours = _of_hand(head, hand, anchor, share, outward, radius, near)
+        ids, weights = _samples(hand, np.arange(count), None if edges is None else edges[1][h], head)
+        m = _meet(hand, ids, weights, head, outward, False, radius, near)
+        ours = m.points, m.normals, m.other_ids, m.other_weights, m.depth, m.ids, m.weights
         low, high = hand.box()
         boxed = movable[in_box(head.verts[movable], low - near, high + near)]
         ids, weights = _samples(head, boxed, None if edges is None else edges[0], hand)
-        theirs = _of_head(head, hand, ids, weights, outward, radius, near)
+        m = _way_out(_meet(head, ids, weights, hand, outward, True, radius, near), hand)
+        theirs = m.nearest, m.normals, m.ids, m.weights, m.depth, m.other_ids, m.other_weights
         parts += [(*part[:4], np.full(len(part[0]), h), *part[4:]) for part in (ours, theirs)]
     return Contacts(*(np.ascontiguousarray(np.concatenate(column)) for column in zip(*parts, strict=True)))
 
@@ -244,61 +247,81 @@ def _dips(mesh: DeformingMesh, other: DeformingMesh, edges: np.ndarray) -> tuple
     return edges[found][:, [0, 1, 1]], np.stack((1.0 - way, way, np.zeros(len(way))), axis=1)
 
 
-def _of_hand(
-    head: DeformingMesh, hand: DeformingMesh, anchor: np.ndarray, share: np.ndarray, outward: np.ndarray,
-    radius: float, near: float,
-) -> tuple[np.ndarray, ...]:  # fmt: skip
-    """Contacts of points of the hand with faces of the head, as in `Contacts` but without `hand`."""
-    points = np.einsum("pc,pci->pi", share, hand.verts[anchor])
-    distance, face, weight = head.signed(points, radius)
-    found = np.flatnonzero((face >= 0) & (distance < near))
-    depth = -distance[found]
-    inside, distance = depth > 0.0, np.abs(depth)
-    face, weight, p = face[found], weight[found], points[found]
-    q = surface_points(head.verts, head.faces, face, weight)
-    ids = head.faces[face]
-    away = _unit(np.einsum("pc,pci->pi", weight, outward[ids]))
-    normal = _direction(p, q, distance, inside, away)
-    wrong = (normal * away).sum(1) < 0.2
-    normal[wrong] = away[wrong]
-    return p, normal, ids, weight, depth, anchor[found], share[found]
+class _Meeting(NamedTuple):
+    """Points of one mesh near another: where they are made of, what they are nearest to, the normal head to hand.
+
+    `turned`: the normal is the head's own, as the shortest way apart would pull the skin outwards.
+    """
+
+    points: np.ndarray
+    ids: np.ndarray
+    weights: np.ndarray
+    nearest: np.ndarray
+    other_ids: np.ndarray
+    other_weights: np.ndarray
+    depth: np.ndarray
+    normals: np.ndarray
+    turned: np.ndarray
 
 
-def _of_head(
-    head: DeformingMesh, hand: DeformingMesh, ids: np.ndarray, weights: np.ndarray, outward: np.ndarray,
-    radius: float, near: float,
-) -> tuple[np.ndarray, ...]:  # fmt: skip
-    """Contacts of points of the head with faces of the hand, as in `Contacts` but without `hand`."""
-    points = np.einsum("pc,pci->pi", weights, head.verts[ids])
-    distance, face, weight = hand.signed(points, radius)
+def _meet(
+    own: DeformingMesh, ids: np.ndarray, weights: np.ndarray, other: DeformingMesh, outward: np.ndarray,
+    skin: bool, radius: float, near: float,
+) -> _Meeting:  # fmt: skip
+    """Points of a mesh inside another, or nearer than `near`; `skin` if they are the head's, not the hand's."""
+    points = _surface_points(own.verts, ids, weights)
+    distance, face, share = other.signed(points, radius)
     found = np.flatnonzero((face >= 0) & (distance < near))
-    depth = -distance[found]
-    inside, distance = depth > 0.0, np.abs(depth)
-    ids, weights, x = ids[found], weights[found], points[found]
-    face, weight = face[found], weight[found]
-    away = _unit(np.einsum("pc,pci->pi", weights, outward[ids]))
-    q = surface_points(hand.verts, hand.faces, face, weight)
-    # From hand to head is the direction out of the hand; the contact's normal is its opposite.
-    normal = -_direction(x, q, distance, inside, -away)
-    wrong = (normal * away).sum(1) < -0.2
-    normal[wrong] = away[wrong]
-    through = np.flatnonzero(wrong & inside)
+    points, ids, weights, share, depth = points[found], ids[found], weights[found], share[found], -distance[found]
+    corners = other.faces[face[found]]
+    nearest = _surface_points(other.verts, corners, share)
+    away = _surface_points(outward, ids, weights) if skin else _surface_points(outward, corners, share)
+    normals, turned = _normals(points, nearest, depth, away, skin)
+    return _Meeting(points, ids, weights, nearest, corners, share, depth, normals, turned)
+
+
+def _way_out(found: _Meeting, hand: DeformingMesh) -> _Meeting:
+    """Head points in a hand, those whose normal was turned with the place where the inward normal leaves the hand."""
+    through = np.flatnonzero(found.turned & (found.depth > 0.0))
     if len(through):
-        paths = x[through, None] - _MARCH[:, None] * away[through, None]
+        paths = found.points[through, None] - _MARCH[:, None] * found.normals[through, None]
         blocked = hand.inside(paths.reshape(-1, 3)).reshape(len(through), -1)
         first = np.where(blocked.all(axis=1), len(_MARCH) - 1, np.argmin(blocked, axis=1))
-        q[through] = paths[np.arange(len(through)), first]
-    keep = ~wrong | inside
-    return q[keep], normal[keep], ids[keep], weights[keep], depth[keep], hand.faces[face[keep]], weight[keep]
+        found.nearest[through] = paths[np.arange(len(through)), first]
+    keep = ~found.turned | (found.depth > 0.0)
+    return found if keep.all() else _Meeting(*(column[keep] for column in found))
 
 
-def _direction(
-    points: np.ndarray, nearest: np.ndarray, distance: np.ndarray, inside: np.ndarray, otherwise: np.ndarray
-) -> np.ndarray:
-    """Unit vectors out of a surface at `nearest`, from points on either side of it."""
-    way = np.where(inside[:, None], nearest - points, points - nearest)
-    return np.where((distance > 1e-6)[:, None], way / np.maximum(distance, 1e-12)[:, None], otherwise)
+@numba.njit(cache=True, error_model="numpy")
+def _surface_points(values, ids, weights):
+    """Weighted sums (P, 3) of rows of `values` (V, 3): ids (P, 3), weights (P, 3)."""
+    result = np.zeros((len(ids), 3))
+    for p in range(len(ids)):
+        a, b, c = ids[p, 0], ids[p, 1], ids[p, 2]
+        u, v, w = weights[p, 0], weights[p, 1], weights[p, 2]
+        for i in range(3):
+            result[p, i] = u * values[a, i] + v * values[b, i] + w * values[c, i]
+    return result
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+@numba.njit(cache=True, error_model="numpy")
+def _normals(points, nearest, depth, away, skin):
+    """Unit normals from head to hand (P, 3), and which were turned; `away` (P, 3) is out of the head, any length."""
+    normals, turned = np.zeros((len(points), 3)), np.zeros(len(points), np.bool_)
+    sign = -1.0 if skin else 1.0
+    for p in range(len(points)):
+        a0, a1, a2 = away[p, 0], away[p, 1], away[p, 2]
+        length = max(math.sqrt(a0 * a0 + a1 * a1 + a2 * a2), 1e-12)
+        a0, a1, a2 = a0 / length, a1 / length, a2 / length
+        normals[p, 0], normals[p, 1], normals[p, 2] = a0, a1, a2
+        distance = abs(depth[p])
+        if distance > 1e-6:
+            # Out of the surface at `nearest`, from either side of it; from a hand to its outside is towards the head.
+            scale = distance * (sign if depth[p] > 0.0 else -sign)
+            n0 = (nearest[p, 0] - points[p, 0]) / scale
+            n1 = (nearest[p, 1] - points[p, 1]) / scale
+            n2 = (nearest[p, 2] - points[p, 2]) / scale
+            turned[p] = n0 * a0 + n1 * a1 + n2 * a2 < 0.2 * sign
+            if not turned[p]:
+                normals[p, 0], normals[p, 1], normals[p, 2] = n0, n1, n2
+    return normals, turned

@@ -12,13 +12,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 
 from nbavatar.mesh.bvh import DeformingMesh
-from nbavatar.mesh.drawing import vertex_normals
 from nbavatar.mesh.topology import edges
 from nbavatar.physics.collision import Contacts, deepest_edge, estimate_overlap, find_contacts, measure_overlap
+from nbavatar.physics.region import Region, Skin
 from nbavatar.physics.rigid import rigid_motion, rotation_matrix
 from nbavatar.physics.tissue import SoftSurface
 from nbavatar.physics.xpbd import relax
@@ -108,10 +106,7 @@ class ContactSolver:
             self._inverse_mass[pinned] = 0.0
         self._support = surface.bed * surface.area
         self._bend = numbers.bending * surface.area
-        a, b = surface.edges.T
-        length = np.maximum(np.linalg.norm(head_rest[a] - head_rest[b], axis=1), 1e-9)
-        self._graph = scipy.sparse.csr_matrix((length, (a, b)), shape=(self._count,) * 2)
-        self._smoother = _smoother(surface)
+        self._skin = Skin(surface, head_rest, numbers.reach)
         # A hand's inertia matches its hold, so that it finds its balance within a few steps at any stiffness.
         hold = np.maximum([numbers.hand_stiffness, numbers.hand_turn_stiffness], 1e-3) * numbers.time_step**2
         self._pose_inverse_mass = np.tile(1.0 / hold, (len(hands), 1))
@@ -137,17 +132,16 @@ class ContactSolver:
         depth, free = self._probe(head, hands)
         if free is not None and n.contact_only:
             return free
-        outward = self._outward(head)
+        outward = self._skin.outward(head, self._head.faces)
         dent, pose, start = self._begin(head, hands, outward, before, head_before, hands_before)
         centre = np.array([hand.mean(axis=0) for hand in hands])
         travel = max(float(np.linalg.norm(a - b, axis=1).max()) for a, b in zip(hands, start, strict=True))
         path = int(np.clip(math.ceil(travel / n.step), 1, n.max_steps))
         x = head + dent
-        old = np.abs(dent).max(axis=1) > 1e-6
-        touched = np.zeros(self._count, bool)
         # What was dented in the frame before springs back, touched or not.
-        active = self._active(touched, old)
-        local = self._local(active, head)
+        old = np.abs(dent).max(axis=1) > 1e-6 if n.contact_only else np.ones(self._count, bool)
+        distance = np.full(self._count, np.inf)
+        region = self._skin.region(np.flatnonzero(old), head)
         last = [self._posed(s, pose[k], centre[k]) for k, s in enumerate(start)]
         total = path + n.settle
         done = 0
@@ -155,22 +149,20 @@ class ContactSolver:
             share = min(step / path, 1.0)
             there = [s + share * (hand - s) for s, hand in zip(start, hands, strict=True)]
             now = [self._posed(p, pose[k], centre[k]) for k, p in enumerate(there)]
-            contacts = self._contacts(x, now, outward, active)
-            hit = np.unique(contacts.ids)
-            if len(hit) and not touched[hit].all():
-                touched[hit] = True
-                active = self._active(touched, old)
-                local = self._local(active, head)
-            if not len(active):
+            contacts = self._contacts(x, now, outward, region.active)
+            if (distance[contacts.ids] > 0.0).any():
+                self._skin.spread(distance, contacts.ids.ravel())
+                region = self._skin.region(np.flatnonzero(np.isfinite(distance) | old), head)
+            if not len(region.active):
                 last = now
                 continue
             previous = np.einsum("pc,pci->pi", contacts.anchor_weights, _gather(last, contacts))
-            self._relax(x, head, local, contacts, previous, pose, centre, n.iterations, held=step < path)
+            self._relax(x, head, region, contacts, previous, pose, centre, n.iterations, held=step < path)
             last = now
             done += 1
         final = [self._posed(hand, pose[k], centre[k]) for k, hand in enumerate(hands)]
-        self._repair(x, head, final, outward, active)
-        return self._result(x, head, outward, final, pose, depth, done, len(active))
+        self._repair(x, head, final, outward, region)
+        return self._result(x, head, outward, final, pose, depth, done, len(region.active))
 
     def _probe(self, head: np.ndarray, hands: list[np.ndarray]) -> tuple[float, FrameResult | None]:
         """Depth before, and the result if there is nothing to do."""
@@ -191,7 +183,7 @@ class ContactSolver:
         if deepest > n.tolerance:
             return deepest, None
         if head_contact.any() or any(touching.any() for touching in hand_contact):
-            self._label(head, hands, self._outward(head), head_contact, hand_contact)
+            self._label(head, hands, self._skin.outward(head, self._head.faces), head_contact, hand_contact)
         pose = np.zeros((len(hands), 6))
         return deepest, FrameResult(head, hands, pose, head_contact, hand_contact, (deepest, deepest), 0, False, 0)
 
@@ -265,67 +257,41 @@ class ContactSolver:
             mine = contacts.hand == k
             touching[contacts.anchor[mine][contacts.anchor_weights[mine] > 0.2]] = True
 
-    def _active(self, touched: np.ndarray, old: np.ndarray) -> np.ndarray:
-        """Vertices within reach of what is touched, along the surface, and those that were dented before."""
-        if not self.numbers.contact_only:
-            return np.arange(self._count)
-        if not touched.any():
-            return np.flatnonzero(old)
-        distance = scipy.sparse.csgraph.dijkstra(
-            self._graph, directed=False, indices=np.flatnonzero(touched), limit=self.numbers.reach, min_only=True
-        )
-        return np.flatnonzero(np.isfinite(distance) | old)
-
-    def _local(self, active: np.ndarray, head: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Active ids, inverse masses (0 elsewhere), edges with their rest lengths, faces, bulge."""
-        moving = np.zeros(self._count, bool)
-        moving[active] = True
-        inverse_mass = np.where(moving, self._inverse_mass, 0.0)
-        (a, b), (i, j, k) = self.surface.edges.T, self.surface.faces.T
-        pairs = self.surface.edges[moving[a] | moving[b]]
-        lengths = np.linalg.norm(head[pairs[:, 0]] - head[pairs[:, 1]], axis=1)
-        faces = self.surface.faces[moving[i] & moving[j] & moving[k]]
-        return active, inverse_mass, pairs, lengths, faces, moving.astype(np.float64)
-
     def _relax(
-        self, x: np.ndarray, head: np.ndarray, local: tuple[np.ndarray, ...], contacts: Contacts, previous: np.ndarray,
+        self, x: np.ndarray, head: np.ndarray, region: Region, contacts: Contacts, previous: np.ndarray,
         pose: np.ndarray, centre: np.ndarray, iterations: int, held: bool,
     ) -> None:  # fmt: skip
         n, s = self.numbers, self.surface
-        active, inverse_mass, pairs, lengths, faces, bulge = local
+        inverse_mass = np.where(region.moving > 0.0, self._inverse_mass, 0.0)
         table = np.concatenate((contacts.points, previous, contacts.normals), axis=1)
         relax(
-            x, head, inverse_mass, active, self._support, pairs, lengths, n.stretch, n.shear, s.ring, s.ring_ids,
-            s.ring_weights,
-            self._bend, faces, bulge, n.volume, table, contacts.ids, contacts.weights, contacts.hand, pose,
+            x, head, inverse_mass, region.active, self._support, region.edges, region.lengths, n.stretch, n.shear,
+            s.ring, s.ring_ids, s.ring_weights, self._bend, region.faces, region.moving, n.volume, table,
+            contacts.ids, contacts.weights, contacts.hand, pose,
             np.zeros_like(pose[:, :2]) if held else self._pose_inverse_mass,
             np.array([n.hand_stiffness, n.hand_turn_stiffness]),
             np.array([n.hand_shift, n.hand_turn]), centre, n.time_step, iterations, n.friction, n.max_dent,
         )  # fmt: skip
 
     def _repair(
-        self, x: np.ndarray, head: np.ndarray, hands: list[np.ndarray], outward: np.ndarray, active: np.ndarray
+        self, x: np.ndarray, head: np.ndarray, hands: list[np.ndarray], outward: np.ndarray, region: Region
     ) -> None:
         """Pushes out what is still inside, with the hands held: the guarantee that the step sizes cannot give."""
         n, s = self.numbers, self.surface
-        if not len(active):
+        if not len(region.active):
             return
-        moving = np.zeros(self._count)
-        moving[active] = 1.0
-        moving = np.where(self._inverse_mass > 0, moving, 0.0)
+        moving = np.where(self._inverse_mass > 0, region.moving, 0.0)
         none, no_faces = np.zeros((0, 2), np.int64), np.zeros((0, 3), np.int64)
         held, still = np.zeros((len(hands), 6)), np.zeros((len(hands), 2))
-        a, b = s.edges.T
-        pairs = s.edges[(moving[a] + moving[b]) > 0]
         for turn in range(n.repair):
-            contacts = self._contacts(x, hands, outward, active, near=2e-4, pairs=pairs)
+            contacts = self._contacts(x, hands, outward, region.active, near=2e-4, pairs=region.edges)
             if contacts.depth.max(initial=0.0) <= 0.5 * n.tolerance:
                 break
             table = np.concatenate((contacts.points, contacts.points, contacts.normals), axis=1)
             # Aim a little outside, so that rounding and neighbours do not undo it, and farther when they keep doing so.
             table[:, :3] -= 0.2 * n.tolerance * (1.0 + turn) * contacts.normals
             relax(
-                x, head, moving, active, np.zeros(self._count), none, np.zeros(0), 0.0, 0.0, s.ring, s.ring_ids,
+                x, head, moving, region.active, np.zeros(self._count), none, np.zeros(0), 0.0, 0.0, s.ring, s.ring_ids,
                 s.ring_weights, np.zeros(self._count), no_faces, moving, 0.0, table, contacts.ids, contacts.weights,
                 contacts.hand, held, still, np.zeros(2), np.full(2, np.inf), np.zeros((len(hands), 3)), 1.0, 8, 0.0,
                 n.max_dent,
@@ -356,13 +322,6 @@ class ContactSolver:
         )
         return FrameResult(x, hands, pose, head_contact, hand_contact, (depth, deepest), steps, bool(exceeded), active)
 
-    def _outward(self, head: np.ndarray) -> np.ndarray:
-        """Outward normals of the rest shape, smoothed so that nostrils and lips do not turn them."""
-        normals = vertex_normals(head, self._head.faces)
-        for _ in range(4):
-            normals = self._smoother @ normals
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
     @staticmethod
     def _posed(hand: np.ndarray, pose: np.ndarray, centre: np.ndarray) -> np.ndarray:
         if not pose.any():
@@ -384,12 +343,3 @@ def _gather(hands: list[np.ndarray], contacts: Contacts) -> np.ndarray:
         mine = contacts.hand == h
         out[mine] = hand[contacts.anchor[mine]]
     return out
-
-
-def _smoother(surface: SoftSurface) -> scipy.sparse.csr_matrix:
-    """Row-stochastic average over neighbours and self."""
-    count = len(surface.area)
-    a, b = surface.edges.T
-    matrix = scipy.sparse.coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count))
-    matrix = (matrix + matrix.T + scipy.sparse.eye(count)).tocsr()
-    return scipy.sparse.csr_matrix(scipy.sparse.diags(1.0 / np.asarray(matrix.sum(axis=1)).ravel()) @ matrix)
