@@ -55,14 +55,18 @@ class Billboards(nn.Module):
             alpha_logit: float [F, T, T], finite.
         """
         super().__init__()
+        self._start(half_extents)
+        self.features = nn.Parameter(features.clone())
+        self.alpha_logit = nn.Parameter(alpha_logit.clone())
+
+    def _start(self, half_extents: Tensor) -> None:
+        """Parameters of place: in the middle of the faces, not turned."""
         count = len(half_extents)
         quat = torch.zeros(count, 4, dtype=half_extents.dtype)
         quat[:, 0] = 1.0
         self.mu = nn.Parameter(torch.zeros(count, 3, dtype=half_extents.dtype))
         self.quat = nn.Parameter(quat)
         self.log_scale = nn.Parameter(half_extents.log())
-        self.features = nn.Parameter(features.clone())
-        self.alpha_logit = nn.Parameter(alpha_logit.clone())
 
     def pose(self, frames: FaceFrames, anchors: Tensor | None = None) -> Posed:
         """Place the billboards on a posed mesh (paper, eq. 3 to 5); differentiable, also through the frames.

@@ -19,6 +19,7 @@ from nbavatar.avatar.base import MeshAvatar, Stages, compose
 from nbavatar.avatar.billboards import Billboards, Posed, anchor_quaternions
 from nbavatar.avatar.refine import Refinement
 from nbavatar.avatar.region import Region, full_region, paste, region_of, shift_camera
+from nbavatar.avatar.sized import SizedBillboards
 from nbavatar.avatar.storage import load_avatar, save_avatar
 from nbavatar.avatar.unet import UNet, macs
 from nbavatar.mesh.frames import FaceFrames, face_frames
@@ -83,7 +84,7 @@ class Avatar(MeshAvatar):
     """Neural billboards on the faces of the parts, and the renderer.
 
     Attributes:
-        billboards: one per face.
+        billboards: one per face (`SizedBillboards` where textures have sizes of their own).
         unet: renderer R, or None without deferred rendering.
         refinement: compensation of fitting errors on training frames, or None.
     """
@@ -323,13 +324,17 @@ class Avatar(MeshAvatar):
     @classmethod
     def rebuild(cls, content: Mapping[str, Any], state: Mapping[str, Tensor], record: Mapping[str, Any]) -> "Avatar":
         """An avatar of the stored shape, its values still to be loaded."""
-        billboards = Billboards(
-            torch.ones_like(state["billboards.log_scale"]),
-            state["billboards.features"],
-            state["billboards.alpha_logit"],
-        )
+        architecture = Architecture(**content["architecture"])
+        if "billboards.sizes" in state:
+            billboards = SizedBillboards.of_state(architecture.texels, state, "billboards.")
+        else:
+            billboards = Billboards(
+                torch.ones_like(state["billboards.log_scale"]),
+                state["billboards.features"],
+                state["billboards.alpha_logit"],
+            )
         return cls(
-            Architecture(**content["architecture"]),
+            architecture,
             content["faces"],
             content["vertex_counts"],
             billboards,

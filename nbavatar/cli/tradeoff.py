@@ -6,8 +6,8 @@
     --train-frames  packs of the training cameras: their views decide which billboards contribute
     --protocol      JSON text, a file, or a name (nv1024, ...): which frames of the packs, on which background
     --sheet         JSON text or file: knobs, values, limits of the presets (see config/tradeoff.yaml)
-    --side          longer side of the pictures [px]: smaller frames are rendered so many times (a whole number) as large
-                    that it is reached; quality is judged on the pictures averaged down to the frames' size
+    --side          least longer side of the pictures [px]: smaller frames are rendered a whole number of times as
+                    large; quality is judged on the pictures averaged down to the frames' size
     --out           folder: points.jsonl (log; a sweep that was stopped goes on from it), points.csv (one row a
                     point), points.md, knobs.md (a paragraph a knob), front_{ms,memory,bytes}.{png,pdf}, presets.json,
                     tradeoff.json (all of it, with the run's record); presets.json is also put beside the model, where
@@ -43,6 +43,7 @@ __all__ = ["add_arguments", "main"]
 
 _LONGEST = 8192  # side of a picture [px]
 _CHOOSERS = 4096  # most views kept in mind when contributions are asked for
+_SIZING_VIEWS = 200  # most views whose footprints are taken
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -140,15 +141,9 @@ def _sweep(
     }
     chooser = _Chooser(trains or packs, sequence, sheet.importance_views, device)
     if args.savings:
-        from nbavatar.tradeoff.savings import measure_savings, savings_markdown
-        from nbavatar.tradeoff.tables import rows_csv
-
-        rows = measure_savings(models[0].avatar, shots, chooser(models[0]), net, sheet, device=device)
-        _write(out / "savings.csv", rows_csv(rows))
-        _write(out / "savings.md", savings_markdown(rows))
+        rows = _savings(sheet, models[0], sequence, shots, chooser, net, device)
         record = run_record("tradeoff", config=to_mapping(sheet), inputs=inputs, device=label)
-        write_json(out / "savings.json", {"kind": "savings", "format": 1, "rows": rows, "record": record})
-        print(f"{out}/savings.md: {len(rows)} switches, on and off")
+        _write_savings(out, rows, record)
         return 0
     began = time.monotonic()
     counts = {True: 0, False: 0}
@@ -172,6 +167,32 @@ def _sweep(
     state = "complete" if result.complete else "stopped early, the same command goes on"
     print(f"{out}: {counts[True]} points measured, {counts[False]} remembered; {state}")
     return 0
+
+
+def _savings(
+    sheet: TradeoffConfig, model: Any, sequence: Any, shots: list[Any], chooser: "_Chooser", net: Any, device: str
+) -> list[dict[str, Any]]:
+    """The savings of pictures, and that of the contact stage where the meshes have head and hands."""
+    from nbavatar.tradeoff.contact import contact_only_rows, contact_scene
+    from nbavatar.tradeoff.savings import even_rows, measure_savings
+
+    rows: list[dict[str, Any]] = []
+    footprints = chooser.footprints(model)
+    for row in measure_savings(model.avatar, shots, chooser(model), footprints, net, sheet, device=device):
+        rows.append(row)
+        print(f"{row['saving']} ({row['scene']}): {row['faster']:.2f}x", flush=True)
+    scene = contact_scene(sequence, sheet.offline.contact_frames)
+    return even_rows([*rows, *([] if scene is None else contact_only_rows(scene, sheet.repeats))])
+
+
+def _write_savings(out: Path, rows: list[dict[str, Any]], record: dict[str, Any]) -> None:
+    from nbavatar.tradeoff.savings import savings_markdown
+    from nbavatar.tradeoff.tables import rows_csv
+
+    _write(out / "savings.csv", rows_csv(rows))
+    _write(out / "savings.md", savings_markdown(rows))
+    write_json(out / "savings.json", {"kind": "savings", "format": 1, "rows": rows, "record": record})
+    print(f"{out}/savings.md: {len(rows)} switches, on and off")
 
 
 def _write_results(
@@ -261,7 +282,7 @@ def _shots(
 
 
 class _Chooser:
-    """Contributions of a model's billboards to some training views; computed once, when they are asked for."""
+    """Some training views, and what a model's billboards are in them; computed once, when it is asked for."""
 
     def __init__(self, packs: list[FramePack], sequence: Any, count: int, device: str) -> None:
         self._packs, self._sequence, self._count, self._device = packs, sequence, count, device
@@ -276,19 +297,31 @@ class _Chooser:
         """The largest contribution of every billboard [px]."""
         return self(model).amax(0).tolist()
 
-    def _compute(self, model: Any) -> Any:
-        import numpy as np
+    def footprints(self, model: Any) -> Any:
+        """The largest footprint of every billboard [px]."""
         import torch
 
+        from nbavatar.tradeoff.footprint import largest_footprints
+
+        meshes = {part: torch.from_numpy(self._sequence.parts[part].verts) for part in model.avatar.parts}
+        return largest_footprints(model.avatar, meshes, self._views(), most_views=_SIZING_VIEWS)
+
+    def _views(self) -> list[Any]:
         from nbavatar.data.views import views_of
         from nbavatar.evaluation.protocols import select_frames
-        from nbavatar.tradeoff.session import view_contributions
 
         splits = [
             select_frames(pack.frames, pack.manifest.get("split", {}), "novel_view", _CHOOSERS) for pack in self._packs
         ]
-        views = views_of(self._packs, self._sequence.frames, splits)
-        shots = []
+        return views_of(self._packs, self._sequence.frames, splits)
+
+    def _compute(self, model: Any) -> Any:
+        import numpy as np
+        import torch
+
+        from nbavatar.tradeoff.session import view_contributions
+
+        views, shots = self._views(), []
         for index in _evenly(len(views), self._count):
             verts = {
                 part: torch.from_numpy(np.asarray(self._sequence.parts[part].verts[views[index].row], np.float32))

@@ -31,7 +31,7 @@ from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
 
-_PRUNE_VIEWS = 200  # a billboard shows for many frames, so a sample of the views finds it
+_SAMPLED_VIEWS = 200  # a billboard shows for many frames, so a sample of the views finds it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -124,8 +124,14 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
         if config.prune_margin is not None and config.method == "billboards":
             from nbavatar.tradeoff.prune import prune
 
-            avatar = prune(avatar, meshes, views, margin=config.prune_margin, most_views=_PRUNE_VIEWS)
+            avatar = prune(avatar, meshes, views, margin=config.prune_margin, most_views=_SAMPLED_VIEWS)
             summary["primitives"] = avatar.primitives
+        if config.texture_density is not None and config.method == "billboards":
+            from nbavatar.tradeoff.footprint import largest_footprints, texels_of
+            from nbavatar.tradeoff.reduce import size_textures
+
+            footprints = largest_footprints(avatar, meshes, views, most_views=_SAMPLED_VIEWS)
+            avatar = size_textures(avatar, texels_of(footprints, config.texture_density))
         summary |= {"train_seconds": summary["seconds"], "peak_memory_mb": round(peak_memory_mb(device), 1)}
         avatar.record = {**record, "summary": summary, "threads": torch.get_num_threads()}
         if args.history:

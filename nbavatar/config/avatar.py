@@ -109,6 +109,13 @@ class TrainConfig:
         min=0,
         max=90,
     )
+    texture_density: float | None = option(
+        None,
+        "After training, keep every texture at so many texels a pixel of its largest footprint in the training views; "
+        "all stay at `texels` a side by default [1/px].",
+        min=0.01,
+        max=64,
+    )
     max_bad_steps: int = option(20, "Non-finite steps in a row before training stops.", min=1)
     previews: int = option(6, "Preview pictures over the whole training.", min=0)
     checkpoint_seconds: float = option(60.0, "Time between checkpoints [s].", min=0)

@@ -259,27 +259,27 @@ def _timed(avatar: TunedAvatar, shot: Shot, device: str) -> dict[str, float]:
 
 
 def peak_memory_mb(avatar: TunedAvatar, shot: Shot, device: str) -> float:
-    """Memory of one picture [MB]: the avatar's tensors and the most that rendering holds besides.
+    """Memory of one picture [MB]: what the avatar keeps, and the most that rendering holds besides.
 
     On a GPU from its allocator. On Linux from the process's peak resident set, which is reset before; elsewhere it
-    cannot be reset, and the tensors alone are counted.
+    cannot be reset, and what the avatar keeps alone is counted.
     """
-    tensors = avatar_bytes(avatar.avatar) / 1e6
+    kept = avatar.kept_bytes() / 1e6
     if device == "cuda":
         torch.cuda.synchronize()
         before = torch.cuda.memory_allocated()
         torch.cuda.reset_peak_memory_stats()
         shot.render(avatar)
-        return tensors + (torch.cuda.max_memory_allocated() - before) / 1e6
+        return kept + (torch.cuda.max_memory_allocated() - before) / 1e6
     _give_back()
     try:
         with open("/proc/self/clear_refs", "w") as stream:
             stream.write("5")
         start = _resident("VmRSS")
         shot.render(avatar)
-        return tensors + max(0.0, _resident("VmHWM") - start)
+        return kept + max(0.0, _resident("VmHWM") - start)
     except OSError:
-        return tensors
+        return kept
 
 
 def _resident(key: str) -> float:

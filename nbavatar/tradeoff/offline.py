@@ -12,7 +12,7 @@ Every row: stage, knob, value, milliseconds (a frame, or once where a stage has 
 
 import dataclasses
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from nbavatar.config.tradeoff import OfflineConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.errors import DataError
 from nbavatar.mesh.bvh import DeformingMesh, surface_points
+from nbavatar.tradeoff.contact import ContactScene, contact_scene
 
 __all__ = ["contact_rows", "decimate", "decimation_rows", "refit_rows", "spectral_rows"]
 
@@ -36,22 +37,15 @@ def contact_rows(sequence: MeshSequence, sheet: OfflineConfig) -> Iterator[dict[
         sequence: head not deformed by contact, hands; `deformation.head` of the dataset if there.
         sheet: values of `iterations` and `settle` (steps after the hand has arrived), number of frames.
     """
-    hands = [name for name in sequence.parts if name != "head"]
-    if "head" not in sequence.parts or not hands:
+    scene = contact_scene(sequence, sheet.contact_frames)
+    if scene is None or not len(scene.deepest):
         return
-    from nbavatar.physics.tissue import bed_stiffness, tissue_thickness
-
-    base = DeformConfig()
-    head = sequence.parts["head"]
-    bed = bed_stiffness(tissue_thickness(head.rest, head.faces), base.modulus)
-    frames = _deepest(sequence, hands, sheet.contact_frames)
-    if not len(frames):
-        return
-    truth = _solved(sequence, hands, bed, dataclasses.replace(base, **_CONVERGED), frames)[0]
+    base, head, frames = DeformConfig(), sequence.parts["head"], scene.deepest
+    truth = _solved(scene, dataclasses.replace(base, **_CONVERGED))[0]
     settings: list[tuple[str, int]] = [("iterations", v) for v in sheet.contact_iterations]
     settings += [("settle", v) for v in sheet.contact_settle]
     for knob, value in settings:
-        verts, ms, depth = _solved(sequence, hands, bed, dataclasses.replace(base, **{knob: value}), frames)
+        verts, ms, depth = _solved(scene, dataclasses.replace(base, **{knob: value}))
         apart = 1e3 * np.linalg.norm(verts - truth, axis=-1)
         moved = np.linalg.norm(truth - head.verts[frames], axis=-1) > 2e-4
         row = _row("contact", knob, value, ms, "mean distance from the converged answer, moved vertices")
@@ -187,47 +181,13 @@ def _closest(mesh: DeformingMesh, points: np.ndarray) -> tuple[np.ndarray, np.nd
     return face, weight, distance
 
 
-def _deepest(sequence: MeshSequence, hands: Sequence[str], count: int) -> np.ndarray:
-    """Frames with the largest overlap of head and hands, in time order."""
-    from nbavatar.physics.collision import measure_overlap
-
-    head = sequence.parts["head"]
-    meshes = {name: DeformingMesh(sequence.parts[name].rest, sequence.parts[name].faces) for name in ("head", *hands)}
-    depth = np.zeros(len(sequence.frames))
-    for frame in range(len(depth)):
-        if not np.isfinite(head.verts[frame]).all():
-            continue
-        meshes["head"].move(np.asarray(head.verts[frame], np.float64))
-        for name in hands:
-            points = np.asarray(sequence.parts[name].verts[frame], np.float64)
-            if np.isfinite(points).all():
-                meshes[name].move(points)
-                counts = len(head.rest), len(points)
-                depth[frame] = max(depth[frame], measure_overlap(meshes["head"], meshes[name], counts, 0.002).deepest)
-    chosen = np.argsort(-depth, kind="stable")[:count]
-    return np.sort(chosen[depth[chosen] > 0])
-
-
-def _solved(
-    sequence: MeshSequence, hands: Sequence[str], bed: np.ndarray, cfg: DeformConfig, frames: np.ndarray
-) -> tuple[np.ndarray, float, float]:
-    """Deformed heads (N, V, 3) of some frames, each from rest; milliseconds a frame; deepest overlap left [m]."""
-    from nbavatar.config.core import to_mapping
-    from nbavatar.physics.contact import ContactNumbers, ContactSolver
-    from nbavatar.physics.tissue import soft_surface
-
-    known = {field.name for field in dataclasses.fields(ContactNumbers)}
-    numbers = ContactNumbers(**{key: value for key, value in to_mapping(cfg).items() if key in known})
-    head = sequence.parts["head"]
-    rest = np.asarray(head.rest, np.float64)
-    parts = [(np.asarray(sequence.parts[name].rest, np.float64), sequence.parts[name].faces) for name in hands]
-    solver = ContactSolver(soft_surface(rest, head.faces, bed), rest, parts, numbers)
+def _solved(scene: ContactScene, cfg: DeformConfig) -> tuple[np.ndarray, float, float]:
+    """Deformed heads (N, V, 3) of the deepest frames, each from rest; milliseconds a frame; overlap left [m]."""
+    solver = scene.solver(cfg)
     verts, spent, depth = [], [], 0.0
-    for frame in frames:
+    for frame in scene.deepest:
         began = time.perf_counter()
-        result = solver.solve(
-            head.verts[frame], [sequence.parts[name].verts[frame] for name in hands], None, None, None
-        )
+        result = scene.solve(solver, int(frame))
         spent.append(1e3 * (time.perf_counter() - began))
         verts.append(result.head)
         depth = max(depth, result.depth[1])

@@ -18,7 +18,7 @@ from nbavatar.errors import DataError
 from nbavatar.tradeoff.contribution import contributions
 from nbavatar.tradeoff.reduce import keep_billboards
 
-__all__ = ["prune", "seen_billboards", "turned_cameras"]
+__all__ = ["prune", "seen_billboards", "spread", "turned_cameras"]
 
 
 def prune(
@@ -48,12 +48,10 @@ def seen_billboards(
         most_views: at most this many of the views, evenly spread.
     """
     device = avatar.faces.device
-    count = min(most_views, len(views))
-    chosen = [views[round(i * (len(views) - 1) / max(1, count - 1))] for i in range(count)]
     seen = torch.zeros(len(avatar.faces), dtype=torch.bool, device=device)
     with torch.no_grad():
         _, alpha = avatar.textures()
-        for view in chosen:
+        for view in spread(views, most_views):
             verts = {part: meshes[part][view.row].to(device) for part in avatar.parts}
             posed, keep = avatar.pose(verts, view.frame)
             if len(posed.means) == 0:
@@ -68,6 +66,12 @@ def seen_billboards(
                 rows = slice(None) if keep is None else keep
                 seen[rows] |= added > 0
     return seen
+
+
+def spread(views: Sequence[View], most: int) -> list[View]:
+    """At most so many views, evenly spread over all, with the ends."""
+    count = min(most, len(views))
+    return [views[round(i * (len(views) - 1) / max(1, count - 1))] for i in range(count)]
 
 
 def turned_cameras(viewmat: Tensor, centre: Tensor, margin: float) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""Smaller avatars made of a trained one: some billboards, some parts, smaller textures."""
+"""Smaller avatars made of a trained one: some billboards, some parts, smaller textures, textures by footprint."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,9 +8,10 @@ from torch import Tensor
 
 from nbavatar.avatar.billboards import Billboards
 from nbavatar.avatar.model import Avatar
-from nbavatar.tradeoff.textures import resample_textures
+from nbavatar.avatar.sized import SizedBillboards, Textures
+from nbavatar.tradeoff.textures import condense_textures, resample_textures
 
-__all__ = ["avatar_bytes", "keep_billboards", "keep_parts", "resize_textures"]
+__all__ = ["avatar_bytes", "keep_billboards", "keep_parts", "resize_textures", "size_textures"]
 
 _FAINTEST = 1e-6  # opacity whose logit stands for nothing; far below what the rasterizer draws
 
@@ -31,7 +32,10 @@ def keep_billboards(avatar: Avatar, kept: Tensor) -> Avatar:
             faces[part] = own[chosen.cpu()]
         first += len(own)
     b = avatar.billboards
-    return _rebuilt(avatar, faces, [value[kept] for value in _values(b)], avatar.architecture.texels)
+    places = [value[kept] for value in _places(b)]
+    with torch.no_grad():
+        those = Billboards(torch.ones_like(places[2]), b.features[kept], b.alpha_logit[kept])
+    return _rebuilt(avatar, faces, those, places, avatar.architecture.texels)
 
 
 def keep_parts(avatar: Avatar, parts: Sequence[str]) -> Avatar:
@@ -50,8 +54,27 @@ def resize_textures(avatar: Avatar, texels: int) -> Avatar:
         features, alpha = resample_textures(shown, b.alpha(), texels)
         if avatar.unet is None:
             features = torch.logit(features, eps=_FAINTEST)
-        values = [b.mu, b.quat, b.log_scale, features, torch.logit(alpha, eps=_FAINTEST)]
-    return _rebuilt(avatar, avatar.part_faces(), values, texels)
+        resized = Billboards(torch.ones_like(b.log_scale), features, torch.logit(alpha, eps=_FAINTEST))
+    return _rebuilt(avatar, avatar.part_faces(), resized, _places(b), texels)
+
+
+def size_textures(avatar: Avatar, sizes: Tensor) -> Avatar:
+    """The avatar with every texture at a size of its own, up to the present one (`nbavatar.avatar.sized`).
+
+    Args:
+        avatar: trained.
+        sizes: texels a side, integers (F,); at least 2 where there are as many now.
+    """
+    b, texels = avatar.billboards, avatar.architecture.texels
+    sizes = sizes.to(b.mu.device).clamp(min(2, texels), texels)
+    with torch.no_grad():
+        features, alpha = b.features, b.alpha()
+        textures = {
+            size: Textures(*condense_textures(features[own], alpha[own], size))
+            for size in torch.unique(sizes).tolist()
+            for own in [sizes == size]
+        }
+    return _rebuilt(avatar, avatar.part_faces(), SizedBillboards(texels, sizes, textures), _places(b), texels)
 
 
 def avatar_bytes(avatar: Avatar) -> int:
@@ -60,21 +83,21 @@ def avatar_bytes(avatar: Avatar) -> int:
     return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
 
 
-def _values(b: Billboards) -> list[Tensor]:
-    return [b.mu, b.quat, b.log_scale, b.features, b.alpha_logit]
-
-
-def _rebuilt(avatar: Avatar, faces: dict[str, Tensor], values: Sequence[Tensor], texels: int) -> Avatar:
-    """An avatar of these billboards (values as in `_values`) with the renderer and refinement of another."""
-    mu, quat, log_scale, features, logits = (value.detach() for value in values)
-    billboards = Billboards(torch.ones_like(log_scale), features, logits)
+def _rebuilt(
+    avatar: Avatar, faces: dict[str, Tensor], billboards: Billboards, places: Sequence[Tensor], texels: int
+) -> Avatar:
+    """An avatar of these billboards, placed by mu, quat and log_scale, with the renderer and refinement of another."""
     with torch.no_grad():
-        for place, value in ((billboards.mu, mu), (billboards.quat, quat), (billboards.log_scale, log_scale)):
-            place.copy_(value)
+        for mine, value in zip((billboards.mu, billboards.quat, billboards.log_scale), places, strict=True):
+            mine.copy_(value)
     architecture = dataclasses.replace(avatar.architecture, texels=texels)
     # Built without a renderer, so that no second U-Net is made only to be dropped.
     plain = dataclasses.replace(architecture, deferred=False)
     counts = {part: avatar.vertex_counts[part] for part in faces}
     result = Avatar(plain, faces, counts, billboards, refinement=avatar.refinement, record=avatar.record)
     result.architecture, result.unet = architecture, avatar.unet
-    return result.to(mu.device).eval()
+    return result.to(avatar.faces.device).eval()
+
+
+def _places(b: Billboards) -> list[Tensor]:
+    return [b.mu, b.quat, b.log_scale]

@@ -6,7 +6,7 @@ the two are compared with each other, and with the truth where there is one.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -17,11 +17,12 @@ from torch import Tensor
 from nbavatar.avatar.model import Avatar
 from nbavatar.config.tradeoff import SettingConfig, TradeoffConfig, vary
 from nbavatar.metrics.lpips import LPIPS
+from nbavatar.tradeoff.footprint import texels_of
 from nbavatar.tradeoff.measure import Shot, difference, peak_memory_mb, quality, reference, time_pairs
-from nbavatar.tradeoff.reduce import avatar_bytes, keep_parts
+from nbavatar.tradeoff.reduce import avatar_bytes, keep_billboards, keep_parts, size_textures
 from nbavatar.tradeoff.tuned import TunedAvatar
 
-__all__ = ["measure_savings", "savings_markdown", "shrunk", "turned_away"]
+__all__ = ["even_rows", "measure_savings", "savings_markdown", "shrunk", "turned_away"]
 
 _FAR = 8.0  # the avatar is this many times smaller in the distant scene
 
@@ -55,26 +56,27 @@ def turned_away(shot: Shot) -> Shot:
 
 
 def measure_savings(
-    avatar: Avatar, shots: Sequence[Shot], importance: Tensor, net: LPIPS, sheet: TradeoffConfig, *, device: str = "cpu"
-) -> list[dict[str, Any]]:
-    """Every switch, on and off.
+    avatar: Avatar, shots: Sequence[Shot], importance: Tensor, footprints: Tensor, net: LPIPS, sheet: TradeoffConfig,
+    *, device: str = "cpu",
+) -> Iterator[dict[str, Any]]:  # fmt: skip
+    """Every switch of a picture, on and off.
 
     Args:
         avatar: trained.
         shots: held-out pictures.
         importance: contributions (N, F) of the billboards to training views.
+        footprints: largest footprint (F,) of the billboards in training views [px].
         net: LPIPS on `device`.
         sheet: repeats and warm-up.
         device: where the avatar computes.
 
-    Returns:
+    Yields:
         One row a switch: `saving`, `scene`, `on_ms`, `off_ms`, `faster` (median ratio of paired pictures), memory and
         bytes on and off, largest difference, share of the pixels that differ by more than 1/255 and LPIPS between
         the two, change of PSNR and LPIPS against the truth where there is one (else None), and the work counted, on and
         off.
     """
-    rows = []
-    for switch in _switches(avatar, shots, importance):
+    for switch in _switches(avatar, shots, importance, footprints):
         times = time_pairs(
             switch.on, switch.off, switch.shots, repeats=sheet.repeats, warmup=sheet.warmup, device=device
         )
@@ -87,53 +89,68 @@ def measure_savings(
                 without, with_it = quality(off, shot, net), quality(on, shot, net)
                 changes.append([(with_it[name] or 0.0) - (without[name] or 0.0) for name in ("psnr", "lpips_net")])
         memory = [peak_memory_mb(side, switch.shots[0], device) for side in (switch.on, switch.off)]
-        rows.append(
-            {
-                "saving": switch.name,
-                "scene": switch.scene,
-                "on_ms": times["ms"]["total"],
-                "off_ms": times["exact_ms"],
-                "faster": times["speedup"],
-                "on_memory_mb": round(memory[0], 1),
-                "off_memory_mb": round(memory[1], 1),
-                "on_mb": round(avatar_bytes(switch.on.avatar) / 1e6, 3),
-                "off_mb": round(avatar_bytes(switch.off.avatar) / 1e6, 3),
-                "diff_max": max(row["diff_max"] for row in apart),
-                **{name: fmean(row[name] for row in apart) for name in ("diff_share", "lpips_apart")},
-                "psnr_change": fmean(c[0] for c in changes) if changes else None,
-                "lpips_change": fmean(c[1] for c in changes) if changes else None,
-                **{f"{side}_{name}": value for side in work for name, value in work[side].items()},
-            }
-        )
-    return rows
+        yield {
+            "saving": switch.name,
+            "scene": switch.scene,
+            "on_ms": times["ms"]["total"],
+            "off_ms": times["exact_ms"],
+            "faster": times["speedup"],
+            "on_memory_mb": memory[0],
+            "off_memory_mb": memory[1],
+            "on_mb": avatar_bytes(switch.on.avatar) / 1e6,
+            "off_mb": avatar_bytes(switch.off.avatar) / 1e6,
+            "diff_max": max(row["diff_max"] for row in apart),
+            **{name: fmean(row[name] for row in apart) for name in ("diff_share", "lpips_apart")},
+            "psnr_change": fmean(c[0] for c in changes) if changes else None,
+            "lpips_change": fmean(c[1] for c in changes) if changes else None,
+            **{f"{side}_{name}": value for side in work for name, value in work[side].items()},
+        }
+
+
+def even_rows(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows with the same keys: None where a row has no such value."""
+    rows = list(rows)
+    names = dict.fromkeys(name for row in rows for name in row)
+    return [{name: row.get(name) for name in names} for row in rows]
 
 
 def savings_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as a table to read."""
+    """The rows of `even_rows` as a table to read."""
     head = ["saving", "scene", "ms on", "ms off", "faster", "memory on / off [MB]", "avatar on / off [MB]",
-            "pixels changed", "PSNR [dB]", "LPIPS", "decoded pixels on / off", "billboards posed on / off"]  # fmt: skip
+            "pixels changed", "LPIPS apart", "PSNR [dB]", "LPIPS", "apart [mm]", "decoded pixels on / off",
+            "billboards or vertices on / off"]  # fmt: skip
     lines = ["| " + " | ".join(head) + " |", "|---|---|" + "---:|" * (len(head) - 2)]
     for row in rows:
-        judged = row["psnr_change"] is not None
+
+        def pair(name: str, form: str, row: Mapping[str, Any] = row) -> str:
+            return " / ".join(_cell(row.get(f"{side}_{name}"), form) for side in ("on", "off")).strip(" /")
+
+        share = row.get("diff_share")
         cells = [
             row["saving"],
             row["scene"],
             f"{row['on_ms']:.1f}",
             f"{row['off_ms']:.1f}",
             f"{row['faster']:.2f}x",
-            f"{row['on_memory_mb']:.0f} / {row['off_memory_mb']:.0f}",
-            f"{row['on_mb']:.2f} / {row['off_mb']:.2f}",
-            f"{100 * row['diff_share']:.2f}%",
-            f"{row['psnr_change']:+.3f}" if judged else "",
-            f"{row['lpips_change']:+.4f}" if judged else "",
-            f"{row['on_decoded_pixels']} / {row['off_decoded_pixels']}",
-            f"{row['on_posed']} / {row['off_posed']}",
+            pair("memory_mb", ".1f"),
+            pair("mb", ".2f"),
+            "" if share is None else f"{100 * share:.2f}%",
+            _cell(row.get("lpips_apart"), ".4f"),
+            _cell(row.get("psnr_change"), "+.3f"),
+            _cell(row.get("lpips_change"), "+.4f"),
+            _cell(row.get("error_mm"), ".3f"),
+            pair("decoded_pixels", "d"),
+            pair("posed", "d"),
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
-def _switches(avatar: Avatar, shots: Sequence[Shot], importance: Tensor) -> list[_Switch]:
+def _cell(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
+
+
+def _switches(avatar: Avatar, shots: Sequence[Shot], importance: Tensor, footprints: Tensor) -> Iterator[_Switch]:
     exact = SettingConfig(roi=False)
 
     def tuned(**change: Any) -> TunedAvatar:
@@ -143,30 +160,33 @@ def _switches(avatar: Avatar, shots: Sequence[Shot], importance: Tensor) -> list
     away = [turned_away(shot) for shot in shots]
     base, window = tuned(), tuned(roi=True)
     distant = f"avatar {_FAR:g}x smaller"
-    switches = [
-        _Switch("region of interest", "held-out pictures", window, base, shots, True),
-        _Switch("region of interest", distant, window, base, far, False),
-        _Switch("empty pictures skipped", "avatar behind the camera", base, _Unaware(avatar, exact), away, False),
-        _Switch("billboards pruned to 75%", "held-out pictures", tuned(billboards=0.75), base, shots, True),
-        _Switch("early ray stop (t_min 1e-4)", "held-out pictures", base, tuned(t_min=0.0), shots, True),
-        _Switch("early ray stop (t_min 0.01)", "held-out pictures", tuned(t_min=0.01), base, shots, True),
-        _Switch("textures by size on screen", "held-out pictures", tuned(mips=True), base, shots, True),
-        _Switch("textures by size on screen", distant, tuned(roi=True, mips=True), window, far, False),
-        _Switch("all window and texture savings", distant, tuned(roi=True, mips=True), base, far, False),
-    ]
-    if avatar.architecture.texels > 1:
-        half = (avatar.architecture.texels + 1) // 2
-        switches.append(
-            _Switch(f"textures of {half} texels", "held-out pictures", tuned(texels=half), base, shots, True)
-        )
+    yield _Switch("region of interest", "held-out pictures", window, base, shots, True)
+    yield _Switch("region of interest", distant, window, base, far, False)
+    yield _Switch("empty pictures skipped", "avatar behind the camera", base, _Unaware(avatar, exact), away, False)
+    shown = (importance.amax(0) > 0).nonzero().squeeze(1)
+    seen = TunedAvatar(keep_billboards(avatar, shown.to(avatar.faces.device)), exact)
+    yield _Switch("billboards that training views show", "held-out pictures", seen, base, shots, True)
+    yield _Switch("billboards pruned to 75%", "held-out pictures", tuned(billboards=0.75), base, shots, True)
+    yield _Switch("early ray stop (t_min 1e-4)", "held-out pictures", base, tuned(t_min=0.0), shots, True)
+    yield _Switch("early ray stop (t_min 0.01)", "held-out pictures", tuned(t_min=0.01), base, shots, True)
+    yield _Switch("level of detail", "held-out pictures", tuned(mips=True), base, shots, True)
+    yield _Switch("level of detail", distant, tuned(roi=True, mips=True), window, far, False)
+    yield _Switch("window and level of detail", distant, tuned(roi=True, mips=True), base, far, False)
+    texels = avatar.architecture.texels
+    if texels > 1:
+        for density in (1.0, 2.0):
+            sized = TunedAvatar(size_textures(avatar, texels_of(footprints, density)), exact)
+            name = f"textures by footprint ({density:g} texels a pixel)"
+            yield _Switch(name, "held-out pictures", sized, base, shots, True)
+        half = (texels + 1) // 2
+        yield _Switch(f"textures of {half} texels", "held-out pictures", tuned(texels=half), base, shots, True)
     if len(avatar.parts) > 1:
         alone = avatar.parts[0]
         one = [dataclasses.replace(shot, verts={alone: shot.verts[alone]}) for shot in shots]
-        only = TunedAvatar(keep_parts(avatar, [alone]), exact)
         unaware = _Unaware(avatar, exact)
-        switches.append(_Switch("absent parts left out", f"{alone} only", base, unaware, one, False))
-        switches.append(_Switch(f"an avatar of {alone} only", f"{alone} only", only, unaware, one, False))
-    return switches
+        yield _Switch("absent parts left out", f"{alone} only", base, unaware, one, False)
+        only = TunedAvatar(keep_parts(avatar, [alone]), exact)
+        yield _Switch(f"an avatar of {alone} only", f"{alone} only", only, unaware, one, False)
 
 
 class _Unaware(TunedAvatar):

@@ -2,8 +2,9 @@
 
 A texture of T texels a side is the continuous function sum_j a_j tent_j(x) on each axis, with texel centres from -1 to
 1 and zeros beyond (`nbavatar.raster`). The best texture of another size, in least squares, is the projection of that
-function onto its own tents; it is a matrix of (T', T), applied to rows and columns. Opacity and premultiplied features
-are projected, since it is their product that reaches the picture.
+function onto its own tents; it is a matrix of (T', T), applied to rows and columns. For a texture that is to be shown
+interpolated (`nbavatar.avatar.sized`) it is the nearest function that interpolation can reach. Opacity and
+premultiplied features are projected, since it is their product that reaches the picture.
 """
 
 import functools
@@ -11,7 +12,9 @@ import functools
 import torch
 from torch import Tensor
 
-__all__ = ["projection_matrix", "resample_textures"]
+from nbavatar.avatar.sized import enlarged
+
+__all__ = ["condense_textures", "projection_matrix", "resample_textures"]
 
 _FAINT = 1e-3  # below this opacity a feature cannot be recovered from its product with it
 
@@ -25,14 +28,15 @@ def projection_matrix(source: int, target: int) -> Tensor:
     """
     if source == target:
         return torch.eye(source, dtype=torch.float64)
-    knots = torch.unique(torch.cat((_knots(source), _knots(target))))
-    left, right = knots[:-1], knots[1:]
-    # Products of two tents are quadratic between knots, where Simpson's rule is exact.
-    points = torch.stack((left, (left + right) / 2, right))
-    weights = (right - left) / 6 * torch.tensor([[1.0], [4.0], [1.0]], dtype=torch.float64)
-    mine, other = _tents(points.flatten(), target), _tents(points.flatten(), source)
-    weighted = mine * weights.flatten()[:, None]
-    return torch.linalg.solve(weighted.T @ mine, weighted.T @ other)
+    return torch.linalg.solve(_products(target, target), _products(target, source))
+
+
+@functools.cache
+def condensing_matrix(source: int, target: int) -> Tensor:
+    """Best texels, in least squares of the interpolated texture, float64 (target, source)."""
+    reach = enlarged(torch.eye(target, dtype=torch.float64)[:, :, None].expand(-1, -1, target), source)[:, :, 0].T
+    weighted = reach.T @ _products(source, source)
+    return torch.linalg.solve(weighted @ reach, weighted)
 
 
 def resample_textures(features: Tensor, alpha: Tensor, texels: int) -> tuple[Tensor, Tensor]:
@@ -42,7 +46,17 @@ def resample_textures(features: Tensor, alpha: Tensor, texels: int) -> tuple[Ten
     """
     if alpha.shape[-1] == texels:
         return features, alpha
-    matrix = projection_matrix(alpha.shape[-1], texels).to(alpha)
+    return _projected(features, alpha, projection_matrix(alpha.shape[-1], texels).to(alpha))
+
+
+def condense_textures(features: Tensor, alpha: Tensor, texels: int) -> tuple[Tensor, Tensor]:
+    """As `resample_textures`, to be shown interpolated at the present size: the nearest there."""
+    if alpha.shape[-1] == texels:
+        return features, alpha
+    return _projected(features, alpha, condensing_matrix(alpha.shape[-1], texels).to(alpha))
+
+
+def _projected(features: Tensor, alpha: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
     opacity = torch.einsum("ir,jc,frc->fij", matrix, matrix, alpha).clamp(0.0, 1.0)
     product = torch.einsum("ir,jc,frck->fijk", matrix, matrix, features * alpha[..., None])
     plain = torch.einsum("ir,jc,frck->fijk", matrix, matrix, features)
@@ -50,6 +64,16 @@ def resample_textures(features: Tensor, alpha: Tensor, texels: int) -> tuple[Ten
     result = torch.where(solid, product / opacity[..., None].clamp_min(_FAINT), plain)
     low, high = features.amin((1, 2), keepdim=True), features.amax((1, 2), keepdim=True)
     return torch.minimum(torch.maximum(result, low), high), opacity
+
+
+def _products(first: int, second: int) -> Tensor:
+    """Integrals of the products of two sizes' tents, (first, second)."""
+    knots = torch.unique(torch.cat((_knots(first), _knots(second))))
+    left, right = knots[:-1], knots[1:]
+    # Products of two tents are quadratic between knots, where Simpson's rule is exact.
+    points = torch.stack((left, (left + right) / 2, right))
+    weights = (right - left) / 6 * torch.tensor([[1.0], [4.0], [1.0]], dtype=torch.float64)
+    return (_tents(points.flatten(), first) * weights.flatten()[:, None]).T @ _tents(points.flatten(), second)
 
 
 def _knots(texels: int) -> Tensor:

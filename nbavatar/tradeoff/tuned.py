@@ -23,7 +23,8 @@ from nbavatar.errors import DataError
 from nbavatar.raster.functional import render_billboards
 from nbavatar.tradeoff.contribution import most_contributing
 from nbavatar.tradeoff.decoder import prepared_unet
-from nbavatar.tradeoff.reduce import keep_billboards, keep_parts, resize_textures
+from nbavatar.tradeoff.footprint import footprints, texels_of
+from nbavatar.tradeoff.reduce import avatar_bytes, keep_billboards, keep_parts, resize_textures
 from nbavatar.tradeoff.textures import resample_textures
 
 __all__ = ["Laps", "TunedAvatar", "Work", "texels_needed"]
@@ -140,6 +141,13 @@ class TunedAvatar:
     def primitives(self) -> int:
         """Billboards that are kept."""
         return self.avatar.primitives
+
+    def kept_bytes(self) -> int:
+        """Memory between pictures [bytes]: the avatar's tensors, and textures made ready for the rasterizer."""
+        own = {tensor.data_ptr() for tensor in self.avatar.parameters()}
+        ready = (tensor for scene in self._scenes.values() for level in scene.levels for tensor in level)
+        made = sum(tensor.numel() * tensor.element_size() for tensor in ready if tensor.data_ptr() not in own)
+        return avatar_bytes(self.avatar) + made
 
     def eval(self) -> "TunedAvatar":
         """Itself: it is never trained."""
@@ -323,9 +331,7 @@ def texels_needed(posed: Posed, viewmat: Tensor, K: Tensor) -> int:
         posed: billboards in world space.
         viewmat: world to camera (4, 4); K: intrinsics (3, 3) [px].
     """
-    depth = (posed.means @ viewmat[2, :3] + viewmat[2, 3]).clamp_min(1e-6)
-    reach = posed.half_extents.amax(1) / depth * torch.maximum(K[0, 0], K[1, 1])
-    return int(torch.ceil(2.0 * torch.quantile(reach, _MIP_SHARE)).clamp(0, 1 << 20)) + 1
+    return int(texels_of(torch.quantile(footprints(posed, viewmat, K), _MIP_SHARE), 1.0))
 
 
 @contextlib.contextmanager

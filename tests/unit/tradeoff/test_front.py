@@ -21,7 +21,14 @@ LIMITS = LimitConfig(psnr=0.1, lpips=0.002)
 
 
 def point(label: str, speedup: float, psnr: float, lpips: float, *, exact_ms: float = 100.0) -> Point:
-    values = {"speedup": speedup, "psnr": psnr, "lpips": lpips, "exact_ms": exact_ms, "diff_share": 0.1, "lpips_apart": 0.01}
+    values = {
+        "speedup": speedup,
+        "psnr": psnr,
+        "lpips": lpips,
+        "exact_ms": exact_ms,
+        "diff_share": 0.1,
+        "lpips_apart": 0.01,
+    }
     return Point("full", label, SettingConfig(), values | {"ms": {"total": exact_ms / speedup}})
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from nbavatar.tradeoff.textures import projection_matrix, resample_textures
+from nbavatar.avatar.sized import enlarged
+from nbavatar.tradeoff.textures import condense_textures, condensing_matrix, projection_matrix, resample_textures
 
 
 def sample(values: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -47,3 +48,32 @@ def test_a_constant_feature_stays_constant_whatever_the_opacity() -> None:
     features = torch.full((4, 8, 8, 2), 0.7)
     smaller, _ = resample_textures(features, torch.rand(4, 8, 8), 4)
     torch.testing.assert_close(smaller, torch.full((4, 4, 4, 2), 0.7))
+
+
+@pytest.mark.parametrize(("source", "target"), [(8, 4), (16, 2), (7, 3), (8, 7)])
+def test_condensed_textures_are_the_nearest_that_interpolation_reaches(source: int, target: int, rng) -> None:
+    values = rng.normal(size=source)
+    kept = condensing_matrix(source, target).numpy() @ values
+    centres = np.linspace(-1, 1, source)
+
+    def error(texels: np.ndarray) -> float:
+        """Squared distance, where a texture is shown, of what interpolation makes of these texels (numpy's own)."""
+        shown = np.interp(centres, np.linspace(-1, 1, target), texels)
+        points = np.linspace(-1.5, 1.5, 3001)
+        return float(np.mean((sample(shown, points) - sample(values, points)) ** 2))
+
+    for _ in range(50):
+        # Near the best any change is worse; the sum over points differs from the integral by some 1e-6.
+        assert error(kept) <= error(kept + 0.05 * rng.normal(size=target)) + 1e-6
+
+
+def test_what_interpolation_made_is_condensed_without_loss() -> None:
+    small = torch.rand(3, 4, 4)
+    features = torch.randn(3, 4, 4, 2)
+    shown = enlarged(small, 8)
+    # One feature all over: only then is the product with the opacity within reach of interpolation.
+    flat = features[:, :1, :1].expand(-1, 8, 8, -1)
+    again, opacity = condense_textures(flat, shown, 4)
+    torch.testing.assert_close(opacity, small, atol=1e-5, rtol=0)
+    torch.testing.assert_close(again, flat[:, :4, :4], atol=1e-4, rtol=0)
+    assert condense_textures(flat, shown, 8)[1] is shown

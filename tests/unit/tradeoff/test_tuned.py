@@ -5,13 +5,15 @@ import torch
 from torch.nn import functional
 
 from nbavatar.avatar.billboards import Billboards, Posed
-from nbavatar.avatar.model import Architecture, Avatar
+from nbavatar.avatar.model import Architecture, Avatar, load_avatar, save_avatar
 from nbavatar.avatar.region import region_of
 from nbavatar.config.tradeoff import SettingConfig, vary
+from nbavatar.data.views import View
 from nbavatar.errors import DataError
 from nbavatar.raster.functional import render_billboards
 from nbavatar.tradeoff.contribution import contributions, most_contributing
-from nbavatar.tradeoff.reduce import avatar_bytes, keep_billboards, keep_parts, resize_textures
+from nbavatar.tradeoff.footprint import largest_footprints, texels_of
+from nbavatar.tradeoff.reduce import avatar_bytes, keep_billboards, keep_parts, resize_textures, size_textures
 from nbavatar.tradeoff.tuned import TunedAvatar, texels_needed
 from tests.scenes.toy import OCTAHEDRON, OCTAHEDRON_FACES, TETRAHEDRON, TETRAHEDRON_FACES
 
@@ -180,6 +182,37 @@ def test_smaller_avatars_share_the_renderer_and_count_their_bytes() -> None:
     assert small.architecture.texels == 4 and small.billboards.features.shape == (12, 4, 4, 4)
     # Two thirds of the billboards' texels and 64 - 16 of the 64 texels each, five floats a texel.
     assert avatar_bytes(avatar) - avatar_bytes(small) == 12 * 48 * 5 * 4
+
+
+def test_textures_of_their_own_sizes_are_shown_as_they_are_kept(tmp_path) -> None:
+    avatar = make_avatar(texels=8)
+    sizes = torch.tensor([8, 2, 3, 8, 5, 2, 2, 4, 8, 3, 2, 7])
+    sized = size_textures(avatar, sizes)
+    # Four floats of features and one of opacity a texel; the sizes themselves take a byte each.
+    assert avatar_bytes(avatar) - avatar_bytes(sized) == 5 * 4 * int((64 - sizes**2).sum()) - 12
+    for whole, own in zip(avatar.textures(), sized.textures(), strict=True):
+        assert torch.equal(whole[sizes == 8], own[sizes == 8]) and not torch.equal(whole, own)
+    save_avatar(tmp_path / "model.pt", sized)
+    again = load_avatar(tmp_path / "model.pt")
+    assert torch.equal(again.billboards.sizes, sizes.to(torch.uint8)) and torch.equal(picture(again), picture(sized))
+    assert torch.equal(picture(TunedAvatar(again, SettingConfig())), picture(sized))
+    assert torch.equal(picture(size_textures(avatar, torch.full((12,), 8))), picture(avatar))
+    # Sized again, and with some of its parts only, it is rendered from what it shows now.
+    shown = keep_parts(sized, ["head"])
+    torch.testing.assert_close(shown.textures()[1], sized.textures()[1][:8], atol=1e-5, rtol=0)
+
+
+def test_the_largest_footprint_by_hand() -> None:
+    avatar = make_avatar()
+    meshes = {part: torch.stack([points, points]) for part, points in VERTS.items()}
+    near, behind = VIEW.clone(), VIEW.clone()
+    near[2, 3], behind[2, 3] = 0.5, -1.0
+    views = [View(0, "c", "f", row, SIZE, SIZE, K, view) for row, view in ((0, VIEW), (1, near), (0, behind))]
+    found = largest_footprints(avatar, meshes, views, most_views=10)
+    posed, _ = avatar.pose(VERTS)
+    expected = 2 * posed.half_extents.amax(1) * 120.0 / (posed.means[:, 2] + 0.5)
+    torch.testing.assert_close(found, expected.detach(), atol=1e-4, rtol=1e-5)
+    assert texels_of(torch.tensor([0.0, 2.9, 10.0]), 2.0).tolist() == [1, 7, 21]
 
 
 def test_mips_are_taken_when_the_avatar_is_small_on_screen() -> None:
