@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nbavatar.reporting.curves import PALETTE, Curve
+from nbavatar.reporting.curves import PALETTE, Curve, ticks
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["curves_figure", "save_figure", "sensitivity_figure"]
@@ -86,7 +87,7 @@ def curves_figure(curves: Sequence[Curve]) -> "Figure":
                     label=name,
                 )
         if curve.log_y and axis.has_data():
-            axis.set_yscale("log")
+            _label_decades(axis)
         axis.set_title(curve.title, fontsize=9)
         axis.set_xlabel("step", fontsize=8)
         axis.set_ylabel(curve.y_label, fontsize=8)
@@ -97,6 +98,15 @@ def curves_figure(curves: Sequence[Curve]) -> "Figure":
     if labels:
         figure.legend(handles, labels, loc="lower center", ncols=min(5, len(labels)), fontsize=7, frameon=False)
     return figure
+
+
+def _label_decades(axis: "Axes") -> None:
+    """A logarithmic vertical axis with few, short labels: those of the page's charts."""
+    axis.set_yscale("log")
+    low, high = (math.log10(value) for value in axis.get_ylim())
+    places = ticks(low, high, True)
+    axis.set_yticks([10**place for place, _ in places], [label for _, label in places])
+    axis.set_yticks([], minor=True)
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from nbavatar.cli import main
 from nbavatar.config.figures import FigureColumn, FigureLayout, read_figures
@@ -15,7 +16,7 @@ from nbavatar.errors import ConfigError
 from nbavatar.io.framepack import FramePack, FramePackWriter
 from nbavatar.reporting.comparison import Rendered, frames_in_contact
 from nbavatar.reporting.contact import best_camera, deepest_frames, dent_pictures, dent_scale
-from nbavatar.reporting.gallery import comparison_drawn
+from nbavatar.reporting.gallery import comparison_drawn, curves_drawn
 from nbavatar.reporting.pareto import Measured, measured_variants, pareto_figure, pareto_front, scatter_chart
 
 ROOT = Path(__file__).parents[3]
@@ -175,6 +176,19 @@ def test_every_figure_of_the_layout_is_drawn_the_same_twice(group, tmp_path):
         assert both[0] == both[1]
         record = json.loads((tmp_path / f"{name}1.json").read_text())
         assert record["record"]["command"] == "figure" and bool(record["shown"]) == (name != "pareto")
+
+
+def test_no_label_of_training_curves_is_cut_off():
+    names = ("psnr", "loss", "delta", "l1", "position")
+    events = [{"step": s} | {name: 2.4e-5 * (1 + s / 40) for name in names} for s in (1, 25, 120)]
+    drawn = curves_drawn({"S2/splatting_avatar_released": events, "S2/full": events[:1]})
+    canvas = FigureCanvasAgg(drawn.figure)
+    canvas.draw()
+    width, height = canvas.get_width_height()
+    for axis in drawn.figure.axes:
+        box = axis.get_tightbbox(canvas.get_renderer())
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height, axis.get_title()
+    assert [text.get_text() for text in drawn.figure.legends[0].get_texts()] == list(drawn.shown)
 
 
 def test_layouts_are_read_and_name_known_variants_and_protocols(tmp_path, capsys):
