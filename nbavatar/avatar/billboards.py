@@ -68,18 +68,22 @@ class Billboards(nn.Module):
         self.quat = nn.Parameter(quat)
         self.log_scale = nn.Parameter(half_extents.log())
 
-    def pose(self, frames: FaceFrames, anchors: Tensor | None = None) -> Posed:
+    def pose(self, frames: FaceFrames, anchors: Tensor | None = None, keep: Tensor | None = None) -> Posed:
         """Place the billboards on a posed mesh (paper, eq. 3 to 5); differentiable, also through the frames.
 
         Args:
             frames: T (F, 3) [m], R (F, 3, 3), k (F,) [m].
             anchors: quaternions of R (F, 4) if known already (`anchor_quaternions`); saves their computation.
+            keep: indices of the billboards that the frames belong to; None for all.
         """
+        mu, quat, log_scale = self.mu, self.quat, self.log_scale
+        if keep is not None:
+            mu, quat, log_scale = mu[keep], quat[keep], log_scale[keep]
         anchor = anchor_quaternions(frames) if anchors is None else anchors
         scale = frames.k[:, None]
-        means = torch.einsum("fij,fj->fi", frames.R, self.mu) * scale + frames.T
-        quats = quaternion_multiply(anchor, normalize_quaternion(self.quat))
-        return Posed(means, quats, scale * self.log_scale.clamp(*_LOG_SCALE_RANGE).exp())
+        means = torch.einsum("fij,fj->fi", frames.R, mu) * scale + frames.T
+        quats = quaternion_multiply(anchor, normalize_quaternion(quat))
+        return Posed(means, quats, scale * log_scale.clamp(*_LOG_SCALE_RANGE).exp())
 
     def alpha(self) -> Tensor:
         """Opacity textures in [0, 1], (F, T, T)."""

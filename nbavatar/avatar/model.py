@@ -50,7 +50,7 @@ class Anchor(NamedTuple):
     """Where the billboards of one frame ride; independent of them, so it may be kept while they are trained.
 
     Attributes:
-        frames: face frames of all parts.
+        frames: face frames of the parts that are there.
         quats: rotations of the frames, wxyz (F, 4).
         keep: indices of the faces whose part is there in this frame, or None for all.
         penalty: of the refinement, scalar [m^2].
@@ -150,15 +150,12 @@ class Avatar(MeshAvatar):
             return points
 
         points, keep = self.merged(verts, refined)
-        frames = face_frames(points, self.faces)
+        frames = face_frames(points, self.faces if keep is None else self.faces[keep])
         return Anchor(frames, anchor_quaternions(frames), keep, penalty)
 
     def place(self, anchor: Anchor) -> tuple[Posed, Tensor | None]:
         """Billboards in world space, and the indices of those that are there (None: all)."""
-        posed = self.billboards.pose(anchor.frames, anchor.quats)
-        if anchor.keep is None:
-            return posed, None
-        return Posed(*(values[anchor.keep] for values in posed)), anchor.keep
+        return self.billboards.pose(anchor.frames, anchor.quats, anchor.keep), anchor.keep
 
     def pose(self, verts: Mapping[str, Tensor], frame: str | None = None) -> tuple[Posed, Tensor | None]:
         """Pose the billboards on one frame's meshes: `anchor` and `place`."""

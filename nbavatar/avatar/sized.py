@@ -76,15 +76,11 @@ class SizedBillboards(Billboards):
         return self._whole("opacity")
 
     def _whole(self, kind: str) -> Tensor:
-        result: Tensor | None = None
+        parts, places = [], []
         for size in torch.unique(self.sizes).tolist():
-            own = self.get_buffer(f"{kind}_{size}")
-            large = enlarged(own, self.texels)
-            if result is None:
-                result = large.new_empty((len(self.sizes), *large.shape[1:]))
-            result[self.sizes == size] = large
-        assert result is not None
-        return result
+            parts.append(enlarged(self.get_buffer(f"{kind}_{size}"), self.texels))
+            places.append((self.sizes == size).nonzero().squeeze(1))
+        return torch.cat(parts)[torch.cat(places).argsort()]
 
 
 def enlarged(textures: Tensor, texels: int) -> Tensor:

@@ -129,11 +129,14 @@ def _proper(faces: np.ndarray) -> np.ndarray:
 def _fit_ellipsoid(points: np.ndarray, inwards: float) -> tuple[np.ndarray, np.ndarray]:
     """Axis-aligned ellipsoid through points, least squares in x^2, x ..., shrunk by `inwards` [m]; centre and radii."""
     middle, size = points.mean(axis=0), np.ptp(points, axis=0).max()
+    half_box = 0.5 * np.ptp(points, axis=0)
+    box = 0.5 * (points.min(axis=0) + points.max(axis=0)), np.maximum(half_box - inwards, 1e-3)
+    if len(points) < 6:  # fewer than the numbers to be found
+        return box
     scaled = (points - middle) / size
     squares, *_ = np.linalg.lstsq(np.concatenate((scaled**2, scaled), axis=1), np.ones(len(points)), rcond=None)
-    half_box = 0.5 * np.ptp(points, axis=0)
-    if (squares[:3] <= 1e-3).any():  # not an ellipsoid: the box's
-        return 0.5 * (points.min(axis=0) + points.max(axis=0)), np.maximum(half_box - inwards, 1e-3)
+    if (squares[:3] <= 1e-3).any():  # not an ellipsoid
+        return box
     centre = -0.5 * squares[3:] / squares[:3]
     radii = np.sqrt((1.0 + (squares[:3] * centre**2).sum()) / squares[:3])
     return middle + size * centre, np.maximum(size * radii - inwards, 1e-3)

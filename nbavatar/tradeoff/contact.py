@@ -57,13 +57,15 @@ class ContactScene(NamedTuple):
 
 
 def contact_scene(sequence: MeshSequence, count: int) -> ContactScene | None:
-    """The scene of a sequence, with at most `count` frames of each kind; None where head or hands are missing."""
+    """The scene of a sequence, with at most `count` frames of each kind; None where no hand ever touches a head."""
     hands = [name for name in sequence.parts if name != "head"]
     if "head" not in sequence.parts or not hands:
         return None
+    depth = _depths(sequence, hands)
+    if not (depth > 0).any():
+        return None
     head = sequence.parts["head"]
     bed = bed_stiffness(tissue_thickness(head.rest, head.faces), DeformConfig().modulus)
-    depth = _depths(sequence, hands)
     chosen = np.argsort(-depth, kind="stable")[:count]
     apart = np.flatnonzero(depth == 0)  # NaN, where a part is not there, is neither
     free = apart[np.unique(np.linspace(0, len(apart) - 1, min(count, len(apart))).astype(int))]

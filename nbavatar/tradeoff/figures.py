@@ -7,7 +7,6 @@ from nbavatar.reporting.curves import PALETTE
 from nbavatar.tradeoff.front import Point, pareto_front
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["COSTS", "front_figure", "offline_figure"]
@@ -29,7 +28,7 @@ def cost_of(point: Point, cost: str) -> float:
 
 
 def front_figure(points: Sequence[Point], presets: Mapping[str, Point], cost: str, caption: str) -> "Figure":
-    """Two panels, PSNR and LPIPS over a cost: all points, the front, the presets.
+    """Two panels, PSNR and LPIPS over a cost: all points, the front, the presets; a key names points of the fronts.
 
     Every avatar has its colour and every preset its own marker, so nothing is told by colour alone.
 
@@ -42,28 +41,37 @@ def front_figure(points: Sequence[Point], presets: Mapping[str, Point], cost: st
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    # Places by hand: matplotlib's own layout measures every label several times, which takes seconds.
-    figure = Figure(figsize=(11.0, 5.0), dpi=120)
-    axes = figure.subplots(1, 2)
-    figure.subplots_adjust(left=0.07, right=0.985, top=0.93, bottom=0.2, wspace=0.2)
     costs = [cost_of(point, cost) for point in points]
+    gains = {key: [float(point.values[key]) for point in points] for key, _, _ in _GAINS}
+    fronts = {key: pareto_front(costs, [sign * gain for gain in gains[key]]) for key, _, sign in _GAINS}
+    named = sorted({i for front in fronts.values() for i in _spread(front)}, key=lambda i: (costs[i], i))
+    numbers = {index: str(number) for number, index in enumerate(named, start=1)}
     models = list(dict.fromkeys(point.model for point in points))
+    # Places by hand [in]: matplotlib's own layout measures every label several times, which takes seconds.
+    rows = -(-len(named) // 2)
+    key_height = 0.17 * rows + 0.1
+    height = 5.0 + key_height
+    figure = Figure(figsize=(11.0, height), dpi=120)
+    axes = figure.subplots(1, 2)
+    bottom = (1.0 + key_height) / height
+    figure.subplots_adjust(left=0.07, right=0.985, top=1 - 0.35 / height, bottom=bottom, wspace=0.2)
     for axis, (key, label, sign) in zip(axes, _GAINS, strict=True):
-        gains = [float(point.values[key]) for point in points]
         for number, model in enumerate(models):
             own = [i for i, point in enumerate(points) if point.model == model]
             colour = _GREY if len(models) == 1 else PALETTE[number % len(PALETTE)]
-            axis.scatter([costs[i] for i in own], [gains[i] for i in own], s=20, c=colour, alpha=0.75,
+            axis.scatter([costs[i] for i in own], [gains[key][i] for i in own], s=20, c=colour, alpha=0.75,
                          label=model if len(models) > 1 else "measured settings", zorder=2)  # fmt: skip
-        front = pareto_front(costs, [sign * gain for gain in gains])
-        axis.step([costs[i] for i in front], [gains[i] for i in front], where="post", color="#0072B2", lw=1.3,
+        front = fronts[key]
+        axis.step([costs[i] for i in front], [gains[key][i] for i in front], where="post", color="#0072B2", lw=1.3,
                   label="front", zorder=1)  # fmt: skip
-        named = {"accurate": points[0], **presets}
-        for number, (name, point) in enumerate(named.items()):
+        for number, (name, point) in enumerate({"accurate": points[0], **presets}.items()):
             axis.scatter([cost_of(point, cost)], [point.values[key]], s=95, marker=_MARKERS[number % len(_MARKERS)],
                          facecolors="none", edgecolors=PALETTE[(number + 1) % len(PALETTE)], linewidths=1.8,
                          label=name, zorder=3)  # fmt: skip
-        _label_front(axis, [points[i] for i in front], [(costs[i], gains[i]) for i in front])
+        for index in front:
+            if index in numbers:
+                axis.annotate(numbers[index], (costs[index], gains[key][index]), xytext=(-7, 6), ha="center",
+                              textcoords="offset points", fontsize=8, color="#222222", zorder=4)  # fmt: skip
         if max(costs) > 3 * min(costs):
             axis.set_xscale("log")
             axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -77,8 +85,16 @@ def front_figure(points: Sequence[Point], presets: Mapping[str, Point], cost: st
         axis.margins(0.12)
         axis.spines[["top", "right"]].set_visible(False)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=min(6, len(labels)), frameon=False, fontsize=9)
-    figure.suptitle(caption, fontsize=10)
+    columns = min(6, len(labels))
+    figure.legend(handles, labels, loc="lower center", bbox_to_anchor=(0.5, (0.05 + key_height) / height),
+                  ncols=columns, frameon=False, fontsize=9)  # fmt: skip
+    several = len(models) > 1
+    for place, index in enumerate(named):
+        name = f"{points[index].model}: {points[index].label}" if several else points[index].label
+        column, row = divmod(place, rows)
+        figure.text(0.03 + 0.49 * column, (key_height - 0.17 * (row + 1)) / height, f"{numbers[index]}  {name}",
+                    fontsize=7.5, color="#222222")  # fmt: skip
+    figure.suptitle(caption, fontsize=10, y=1 - 0.12 / height, va="center")
     return figure
 
 
@@ -119,19 +135,7 @@ def offline_figure(rows: Sequence[Mapping[str, Any]]) -> "Figure":
     return figure
 
 
-def _label_front(axis: "Axes", points: Sequence[Point], places: Sequence[tuple[float, float]]) -> None:
-    """Names up to five points of the front, spread over it."""
-    count = len(points)
-    chosen = sorted({round(i * (count - 1) / 4) for i in range(5)}) if count > 1 else [0]
-    for number, index in enumerate(chosen):
-        above = number % 2 == 0
-        axis.annotate(
-            _wrapped(points[index].label), places[index], xytext=(4, 7 if above else -8), textcoords="offset points",
-            fontsize=7, va="bottom" if above else "top", color="#333333",
-        )  # fmt: skip
-
-
-def _wrapped(label: str) -> str:
-    """Two items a line."""
-    items = label.split(", ")
-    return ",\n".join(", ".join(items[i : i + 2]) for i in range(0, len(items), 2))
+def _spread(front: Sequence[int]) -> list[int]:
+    """Up to six points of a front, spread over it."""
+    last = len(front) - 1
+    return [front[i] for i in sorted({round(n * last / 5) for n in range(6)})]

@@ -31,14 +31,14 @@ _NEAR = 1.0  # search radius around the head [m]
 
 
 def contact_rows(sequence: MeshSequence, sheet: OfflineConfig) -> Iterator[dict[str, Any]]:
-    """The contact solver on the frames with the deepest contact; nothing where head or hands are missing.
+    """The contact solver on the frames with the deepest contact; nothing where no hand touches a head.
 
     Args:
         sequence: head not deformed by contact, hands; `deformation.head` of the dataset if there.
         sheet: values of `iterations` and `settle` (steps after the hand has arrived), number of frames.
     """
     scene = contact_scene(sequence, sheet.contact_frames)
-    if scene is None or not len(scene.deepest):
+    if scene is None:
         return
     base, head, frames = DeformConfig(), sequence.parts["head"], scene.deepest
     truth = _solved(scene, dataclasses.replace(base, **_CONVERGED))[0]

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from nbavatar.avatar.billboards import Posed
 from nbavatar.avatar.model import Avatar
 from nbavatar.config.tradeoff import SettingConfig, TradeoffConfig, vary
 from nbavatar.metrics.lpips import LPIPS
@@ -195,8 +196,14 @@ class _Unaware(TunedAvatar):
     def render(self, verts: Mapping[str, Tensor], *args: Any, laps: Any = None, **options: Any) -> Any:
         viewmat, K, width, height, background = args
         with torch.no_grad():
-            posed, keep = self.avatar.pose(verts)
-            self.work.posed += len(self.avatar.billboards.mu)
+            a = self.avatar
+            nowhere = {part: a.billboards.mu.new_zeros(count, 3) for part, count in a.vertex_counts.items()}
+            posed, keep = a.pose({**nowhere, **verts})[0], None
+            self.work.posed += a.primitives
+            if len(verts) < len(a.parts):
+                there = torch.tensor([part in verts for part in a.parts])
+                keep = there[a.face_groups()].nonzero().squeeze(1).to(a.faces.device)
+                posed = Posed(*(values[keep] for values in posed))
             if laps is not None:
                 laps("pose")
             window = self.avatar.window(posed, keep, viewmat, K, width, height, roi=False)

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from nbavatar.cli import main as cli
 from nbavatar.cli import tradeoff
@@ -128,6 +129,20 @@ def test_training_takes_order_and_window_from_a_preset(tmp_path) -> None:
     assert config.texels == 8 and config.roi_margin == TrainConfig().roi_margin
 
 
+def test_a_training_keeps_textures_by_their_footprint(measured) -> None:
+    from nbavatar.avatar.model import load_avatar
+
+    scene, out = measured["scene"], str(measured["folder"] / "sized" / "model.pt")
+    words = ["train", "--frames", *measured["packs"][:2], *measured["common"], "--spectral", str(scene["spectral"])]
+    options = load_avatar(measured["model"]).record["config"]
+    assert cli([*words, "--out", out, "--cfg", json.dumps({**options, "texture_density": 0.1})]) == 0
+    sized, whole = load_avatar(out), load_avatar(measured["model"])
+    # An octahedron's face is some 30 px wide here, a tetrahedron's a third of that: 0.1 texels a pixel make 4 and 2.
+    assert sized.billboards.sizes.tolist()[:8] == [4] * 8
+    assert sized.textures()[1].shape == whole.textures()[1].shape
+    assert torch.equal(sized.textures()[0][:8], whole.textures()[0][:8])
+
+
 def test_savings_are_measured_on_and_off(measured) -> None:
     once = json.dumps({**SHEET, "images": 1, "repeats": 1})
     assert sweep(*measured["words"], "--sheet", once, "--savings") == 0
@@ -139,4 +154,11 @@ def test_savings_are_measured_on_and_off(measured) -> None:
     assert empty["on_raster_calls"] == empty["on_decoder_calls"] == 0 < empty["off_decoder_calls"]
     head = by_name["absent parts left out", "head only"]
     assert (head["on_posed"], head["off_posed"]) == (8, 12) and head["diff_share"] == 0
+    sized = by_name["textures by footprint (1 texels a pixel)", "held-out pictures"]
+    assert sized["on_mb"] <= sized["off_mb"] + 1e-4 and sized["psnr_change"] is not None
+    names = {name for name, _ in by_name}
+    for name in ("billboards pruned", "billboards that training", "early ray stop", "level of detail"):
+        assert any(saving.startswith(name) for saving in names)
+    text = (measured["folder"] / "out" / "savings.md").read_text()
+    assert "None" not in text and text.count("\n") == len(rows) + 2
     assert all(row["on_ms"] > 0 and row["off_ms"] > 0 for row in rows)
