@@ -26,7 +26,7 @@ from llvmlite import binding
 from numba import njit
 from numba.core import caching
 
-__all__ = ["FAST", "inlined", "keep_kernels", "kernel", "prepare", "run_workers"]
+__all__ = ["FAST", "exact_kernel", "inlined", "keep_kernels", "kernel", "prepare", "run_workers"]
 
 _LOG = logging.getLogger("nbavatar.raster")
 
@@ -34,8 +34,8 @@ _LOG = logging.getLogger("nbavatar.raster")
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 _SOURCES = (
-    "binning.py", "compile.py", "cpu_blend.py", "cpu_gather.py", "cpu_hits.py", "cpu_pixels.py", "cpu_queue.py",
-    "lanes.py", "memory.py", "scalar.py",
+    "binning.py", "compile.py", "cpu_blend.py", "cpu_gather.py", "cpu_hits.py", "cpu_pixels.py", "cpu_projection.py",
+    "cpu_queue.py", "lanes.py", "memory.py", "scalar.py",
 )  # fmt: skip
 
 
@@ -113,6 +113,11 @@ caching.CodeLibraryCacheImpl._locator_classes.insert(0, _Locator)
 def kernel(function: Callable[..., Any]) -> Any:
     """Compiles a kernel: no interpreter lock, cached on disk."""
     return njit(nogil=True, cache=True, fastmath=FAST, error_model="numpy")(function)
+
+
+def exact_kernel(function: Callable[..., Any]) -> Any:
+    """Compiles a kernel whose arithmetic is rounded as it is written."""
+    return njit(nogil=True, cache=True, error_model="numpy")(function)
 
 
 def inlined(function: Callable[..., Any]) -> Any:

@@ -11,7 +11,7 @@ import torch
 from numba import types
 from torch import Tensor
 
-from nbavatar.raster import binning, cpu_blend, cpu_gather, cpu_pixels
+from nbavatar.raster import binning, cpu_blend, cpu_gather, cpu_pixels, workspace
 from nbavatar.raster.binning import bin_billboards, require_memory
 from nbavatar.raster.compile import prepare, run_workers
 from nbavatar.raster.cpu_hits import write_limits
@@ -137,17 +137,24 @@ class _Scene:
             texels * (self.channels + 1) * size + s.width * s.height * (self.stride + 1) * size,
             f"the gradients of {self.count} billboards",
         )
-        grad_features = torch.empty(self.count, self.texels, self.texels, self.channels, dtype=self.dtype)
-        grad_alpha = torch.empty(self.count, self.texels, self.texels, dtype=self.dtype)
+        grad_alpha = torch.from_numpy(workspace.empty((self.count, self.texels, self.texels), self.limits.dtype))
+        shape = (*grad_alpha.shape, self.channels)
+        grad_features = torch.from_numpy(workspace.empty(shape, self.limits.dtype))
         grad_plane = torch.empty(self.count, 3, 3, dtype=torch.float64)
         grad_fade = torch.empty(self.count, dtype=torch.float64)
-        grads = torch.empty(s.height, s.width, self.stride, dtype=self.dtype)
-        grads[..., self.channels :] = 0
-        grads[..., : self.channels] = grad_image.permute(1, 2, 0)
         covers = grad_opacity.to(self.dtype).contiguous().view(-1).numpy()
         outputs = (grad_features.view(-1).numpy(), grad_alpha.view(-1).numpy(), grad_plane.numpy(), grad_fade.numpy())
-        self._replay(grads.view(-1).numpy(), covers, outputs)
+        self._replay(self._rows(grad_image), covers, outputs)
         return grad_features, grad_alpha, grad_plane, grad_fade
+
+    def _rows(self, image: Tensor) -> np.ndarray:
+        """An image (C, H, W) as (H, W, stride), flat."""
+        pixels = self.settings.width * self.settings.height
+        planes = image.to(self.dtype).contiguous().view(-1).numpy()
+        rows = workspace.empty((pixels * self.stride,), self.limits.dtype)
+        turn = np.zeros(1, np.int64)
+        run_workers(lambda _: cpu_gather.interleave(turn, 1 << 14, planes, rows, self.channels, pixels))
+        return rows
 
     def _replay(self, grads: np.ndarray, covers: np.ndarray, outputs: tuple[np.ndarray, ...]) -> None:
         """Repeats the blending, range of tiles by range of tiles, and fills the gradients `outputs`."""
@@ -161,8 +168,8 @@ class _Scene:
             largest * (2 * LANES * self.limits.itemsize + 8) + bands * entries * 8,
             f"the notes of {largest * LANES} hits in the backward pass",
         )
-        notes = torch.empty(2 * LANES * largest, dtype=self.dtype).numpy()
-        spots = torch.empty(2 * largest, dtype=torch.int32).numpy()
+        notes = workspace.empty((2 * LANES * largest,), self.limits.dtype)
+        spots = workspace.empty((2 * largest,), np.dtype(np.int32))
         nothing = np.zeros(0, self.limits.dtype)
         shape = np.array([self.texels, self.channels, self.settings.width], np.int64)
         for number, (first, end) in enumerate(parts):
@@ -211,7 +218,7 @@ class _Scene:
         )
         reals, wholes, wides = cpu_pixels.scratch_sizes(plan.rows, plan.capacity, self.channels, plan.groups, replay)
         values = [self.texels, self.channels, s.width, s.height, self.across, s.queue, plan.capacity, plan.rows,
-                  plan.groups, int(replay)]  # fmt: skip
+                  plan.groups, int(replay), int(s.queue < 0 and plan.capacity > _QUEUE)]  # fmt: skip
         shape = np.array(values, np.int64)
         turn = np.zeros(1, np.int64)
 
@@ -271,6 +278,7 @@ def _prepare(dtype: torch.dtype) -> None:
                 array(real), array(real), array(i64), *[array(real)] * 5, *[array(i32)] * 2, array(i64), i64,
                 array(real), array(i32), array(i64), array(i64),
             ),
+            cpu_gather.interleave: (array(i64), i64, array(real), array(real), i64, i64),
             cpu_gather.gather_gradients: (
                 array(i64), i64, i64, i64, i64, array(i32), array(i64), array(i32), array(i64), array(i32), array(i64),
                 array(real), array(i32), i64, array(real), array(i32, 2), array(real), array(real), array(real),

@@ -31,7 +31,7 @@ from nbavatar.raster.cpu_hits import (
     spans,
 )  # fmt: skip
 from nbavatar.raster.cpu_pixels import Scene, blend, close, divide, settle, write
-from nbavatar.raster.cpu_queue import drain, enqueue, pop
+from nbavatar.raster.cpu_queue import append, arrange, count_waiting, drain, enqueue, pop
 from nbavatar.raster.lanes import (
     LANES,
     any_lane,
@@ -53,6 +53,7 @@ from nbavatar.raster.memory import fetch_add, get, pointer, prefetch, put
 __all__ = ["blend_tiles"]
 
 _PATIENCE = 1024  # hits that wait in a tile's queues before it is looked which of them are final
+_CROWD = 64  # hits that wait at one pixel of unsorted queues before the same
 _AHEAD = 512  # texels of the next billboard's opacity that are asked for in advance
 
 
@@ -68,7 +69,7 @@ def blend_tiles(turn, tiles, start, members_, record_, box, place_, features_, a
         features, alpha: textures, flat.
         limits: see `cpu_hits`.
         shape: texels, channels, width, height, tiles across, queue, capacity of a queue, rows worked on at
-            once, groups that there is room for, replay.
+            once, groups that there is room for, replay, whether hits wait unsorted.
         image, opacity: (C, H, W), (H, W) results, flat; not written in the replay.
         grads: (H, W, stride) flat, gradients of the image, filled up with zeros; grad_opacity: (H, W) flat. These
             and what follows are used in the replay.
@@ -84,7 +85,7 @@ def blend_tiles(turn, tiles, start, members_, record_, box, place_, features_, a
     texels, channels, width, height, across, queue, capacity, rows, room = (
         shape[0], shape[1], shape[2], shape[3], shape[4], shape[5], shape[6], shape[7], shape[8],
     )  # fmt: skip
-    replay = shape[9] != 0
+    replay, unsorted = shape[9] != 0, shape[10] != 0
     members, record, place = pointer(members_, 0), pointer(record_, 0), pointer(place_, 0)
     alpha, limits = pointer(alpha_, 0), pointer(limits_, 0)
     image, opacity = pointer(image_, 0), pointer(opacity_, 0)
@@ -130,6 +131,10 @@ def blend_tiles(turn, tiles, start, members_, record_, box, place_, features_, a
             else:
                 for i in range(pixels * stride):
                     put(k.sums, i, zero)
+            if unsorted:
+                for i in range(plane):
+                    put(k.count, i, 0)
+            crowded = _CROWD if unsorted else capacity
             active = (bottom - top) * (right - left)
             level, groups, waiting = 0, 0, 0
             for entry in range(first_entry, end_entry + 1):
@@ -139,11 +144,18 @@ def blend_tiles(turn, tiles, start, members_, record_, box, place_, features_, a
                 if not final:
                     i = get(members, entry)
                     reach = get(record, i * RECORD + 11)
-                if level > 0 and (final or (queue < 0 and (waiting >= _PATIENCE or level == capacity))):
+                patient = unsorted or waiting < _PATIENCE
+                if level > 0 and (final or (queue < 0 and (level >= crowded or not patient))):
+                    if unsorted:
+                        arrange(scene, k, pixels)
                     level, finished = drain(scene, k, reach, level, left, top, pixels, width, noted)
                     active -= finished
                     waiting = 0
-                    overflow = level == capacity and not final
+                    if unsorted:  # next when the longest queue has doubled: the sorting stays in proportion
+                        count_waiting(scene, k, pixels, level, none)
+                        crowded = max(_CROWD, 2 * level)
+                    else:
+                        overflow = level == capacity and not final
                 if final or overflow or active == 0:
                     break
                 first_group = groups
@@ -215,6 +227,8 @@ def blend_tiles(turn, tiles, start, members_, record_, box, place_, features_, a
                             store(k.through, first, through)
                             _, finished = close(scene, k, first, through)
                             active -= finished
+                        elif unsorted:
+                            level = append(scene, k, word, key, ids, first, level)
                         else:
                             level = enqueue(scene, k, hit, key, opaque, ids, first, level)
                             if queue > 0 and level > queue:

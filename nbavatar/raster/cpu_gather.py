@@ -32,10 +32,11 @@ from nbavatar.raster.lanes import (
     store,
     store_where,
     total,
+    transpose,
 )  # fmt: skip
 from nbavatar.raster.memory import ahead, fetch_add, get, pointer, prefetch, put
 
-__all__ = ["gather_gradients", "scratch_size"]
+__all__ = ["gather_gradients", "interleave", "scratch_size"]
 
 _AHEAD = 8192  # numbers of the next billboard's textures that are asked for in advance
 _NOTES = 8  # groups of the next tile's notes likewise
@@ -44,6 +45,44 @@ _NOTES = 8  # groups of the next tile's notes likewise
 def scratch_size(texels: int, channels: int) -> int:
     """Numbers that a worker needs."""
     return texels * texels * (LANES + -(-channels // LANES) * LANES) + 16 * LANES
+
+
+@inlined
+def _plane(planes, channel, channels, pixels, pixel, here):
+    """Pixels of a channel; 0 where there is none."""
+    none = first_lanes(0)
+    return load_where(planes, min(channel, channels - 1) * pixels + pixel, here if channel < channels else none)
+
+
+@kernel
+def interleave(turn, chunk, planes_, rows_, channels, pixels):
+    """Turns images of one channel each into rows of one pixel each, filled up with zeros to whole vectors.
+
+    Args:
+        turn: (1,) int64, next of the pixels, shared by all workers; `chunk`, whole vectors, are taken at a time.
+        planes: (channels, pixels) flat; rows: (pixels, stride) flat, the result.
+    """
+    planes, rows = pointer(planes_, 0), pointer(rows_, 0)
+    stride = (channels + LANES - 1) // LANES * LANES
+    while True:
+        begin = fetch_add(turn, chunk)
+        if begin >= pixels:
+            break
+        for pixel in range(begin, min(begin + chunk, pixels), LANES):
+            here = first_lanes(pixels - pixel)
+            for c in range(0, channels, LANES):
+                columns = transpose((
+                    _plane(planes, c, channels, pixels, pixel, here),
+                    _plane(planes, c + 1, channels, pixels, pixel, here),
+                    _plane(planes, c + 2, channels, pixels, pixel, here),
+                    _plane(planes, c + 3, channels, pixels, pixel, here),
+                    _plane(planes, c + 4, channels, pixels, pixel, here),
+                    _plane(planes, c + 5, channels, pixels, pixel, here),
+                    _plane(planes, c + 6, channels, pixels, pixel, here),
+                    _plane(planes, c + 7, channels, pixels, pixel, here),
+                ))  # fmt: skip
+                for lane in range(min(LANES, pixels - pixel)):
+                    store(rows, (pixel + lane) * stride + c, columns[lane])
 
 
 @inlined

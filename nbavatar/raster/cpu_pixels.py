@@ -43,6 +43,7 @@ class Scratch(NamedTuple):
     row: Any  # room for two rows of numbers
     whole: Any  # and for one of whole numbers
     ends: Any  # columns of a billboard's rows
+    count: Any  # slots in use at each pixel, where hits are put behind the queues unsorted
     texel: Any  # int64: first channel of each hit's first texel
     before: Any  # replay: the hit blended before each hit at its pixel, or -1
     last: Any  # replay: the hit blended last at each pixel
@@ -53,7 +54,7 @@ def scratch_sizes(rows: int, capacity: int, channels: int, groups: int, replay: 
     plane = TILE_WIDTH * rows + LANES
     stride = -(-channels // LANES) * LANES
     reals = 2 * plane + plane * stride + 2 * capacity * plane + 2 * LANES + groups * 5 * LANES
-    wholes = capacity * plane + groups + LANES + 2 * TILE_HEIGHT + LANES
+    wholes = capacity * plane + groups + LANES + 2 * TILE_HEIGHT + plane
     return reals, wholes + (groups * LANES + plane if replay else 0), groups * LANES
 
 
@@ -84,12 +85,13 @@ def divide(real, whole, wide, plane, stride, capacity, groups):
     weights = row + 2 * LANES
     place = capacity * plane
     rest = place + groups
-    before = rest + 2 * LANES + 2 * TILE_HEIGHT
+    count = rest + LANES + 2 * TILE_HEIGHT
+    before = count + plane
     return Scratch(
         pointer(real, 0), pointer(real, plane), pointer(real, 2 * plane), pointer(real, keys),
         pointer(real, keys + capacity * plane), pointer(whole, 0), pointer(real, weights),
         pointer(real, weights + groups * 4 * LANES), pointer(whole, place), pointer(real, row), pointer(whole, rest),
-        pointer(whole, rest + LANES), pointer(wide, 0), pointer(whole, before),
+        pointer(whole, rest + LANES), pointer(whole, count), pointer(wide, 0), pointer(whole, before),
         pointer(whole, before + groups * LANES),
     )  # fmt: skip
 

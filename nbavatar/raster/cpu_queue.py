@@ -1,7 +1,8 @@
 """Queues of hits, one a pixel, sorted by depth: the nearest in slot 0.
 
 They are stored slot by slot: slot j of all pixels, then slot j + 1. A new row of hits passes the slots from
-the nearest on and in each the nearer of two stays, so no branch depends on a single pixel.
+the nearest on and in each the nearer of two stays, so no branch depends on a single pixel. Where hundreds of
+hits wait at a pixel that is too slow: there they are put behind the queue and sorted before it is looked at.
 """
 
 import numpy as np
@@ -9,9 +10,22 @@ import numpy as np
 from nbavatar.raster.binning import TILE_WIDTH
 from nbavatar.raster.compile import inlined
 from nbavatar.raster.cpu_pixels import SHIFT, blend, close
-from nbavatar.raster.lanes import LANES, any_lane, bits, choose, first_lanes, gather, load, maximum, spread, store
+from nbavatar.raster.lanes import (
+    LANES,
+    any_lane,
+    bits,
+    choose,
+    count_trailing_zeros,
+    first_lanes,
+    gather,
+    load,
+    maximum,
+    spread,
+    store,
+)  # fmt: skip
+from nbavatar.raster.memory import get, put
 
-__all__ = ["drain", "enqueue", "pop"]
+__all__ = ["append", "arrange", "count_waiting", "drain", "enqueue", "pop"]
 
 
 @inlined
@@ -39,6 +53,86 @@ def enqueue(scene, k, hit, key, opacity, ids, first, level):
         slot += 1
         if not any_lane(key > none):
             return max(level, slot)
+
+
+@inlined
+def append(scene, k, word, key, ids, first, level):
+    """Puts the hits with a bit in `word` behind the queues; returns how many slots are in use then."""
+    store(k.row, 0, key)
+    store(k.whole, 0, ids)
+    while word != 0:
+        lane = count_trailing_zeros(word)
+        word &= word - 1
+        pixel = first + lane
+        slot = np.int64(get(k.count, pixel))
+        put(k.keys, slot * scene.plane + pixel, get(k.row, lane))
+        put(k.ids, slot * scene.plane + pixel, get(k.whole, lane))
+        put(k.count, pixel, slot + 1)
+        level = max(level, slot + 1)
+    return level
+
+
+@inlined
+def _behind(k, key, number, other_key, other):
+    """Whether a hit is blended after another one."""
+    if key != other_key:
+        return key < other_key
+    return get(k.place, number >> SHIFT) > get(k.place, other >> SHIFT)
+
+
+@inlined
+def _sink(scene, k, pixel, slot, end, key, number):
+    """Moves a hit down from `slot` in the heap of the slots before `end`, the last one to be blended on top."""
+    while True:
+        child = 2 * slot + 1
+        if child >= end:
+            break
+        at = child * scene.plane + pixel
+        child_key, child_number = get(k.keys, at), np.int64(get(k.ids, at))
+        if child + 1 < end:
+            other_key = get(k.keys, at + scene.plane)
+            other_number = np.int64(get(k.ids, at + scene.plane))
+            if _behind(k, other_key, other_number, child_key, child_number):
+                child, child_key, child_number = child + 1, other_key, other_number
+        if not _behind(k, child_key, child_number, key, number):
+            break
+        put(k.keys, slot * scene.plane + pixel, child_key)
+        put(k.ids, slot * scene.plane + pixel, child_number)
+        slot = child
+    put(k.keys, slot * scene.plane + pixel, key)
+    put(k.ids, slot * scene.plane + pixel, number)
+
+
+@inlined
+def arrange(scene, k, pixels):
+    """Brings queues that were filled by `append` into the order that `enqueue` keeps, by heap sort."""
+    for pixel in range(pixels):
+        count = np.int64(get(k.count, pixel))
+        for step in range(count // 2 + count - 1):
+            if step < count // 2:  # builds the heap
+                slot, end = count // 2 - 1 - step, count
+                at = slot * scene.plane + pixel
+                key, number = get(k.keys, at), np.int64(get(k.ids, at))
+            else:  # takes the hit on top out to the end
+                slot, end = 0, count - 1 - (step - count // 2)
+                at = end * scene.plane + pixel
+                key, number = get(k.keys, at), np.int64(get(k.ids, at))
+                put(k.keys, at, get(k.keys, pixel))
+                put(k.ids, at, get(k.ids, pixel))
+            _sink(scene, k, pixel, slot, end, key, number)
+        for slot in range(count):
+            at = slot * scene.plane + pixel
+            put(k.dims, at, get(k.opacity, np.int64(get(k.ids, at))))
+
+
+@inlined
+def count_waiting(scene, k, pixels, level, none):
+    """Counts the slots in use at each pixel, `level` at most; an empty one holds the key `none`."""
+    for pixel in range(pixels):
+        slot = 0
+        while slot < level and get(k.keys, slot * scene.plane + pixel) > none:
+            slot += 1
+        put(k.count, pixel, slot)
 
 
 @inlined

@@ -15,6 +15,7 @@ __all__ = ["render_billboards"]
 
 _WHERE = "render_billboards"
 _BACKENDS = ("auto", "reference", "cpu", "cuda")
+_Project = Callable[..., Projection]
 _Blend = Callable[[Projection, Tensor, Tensor, Tensor, BlendSettings], tuple[Tensor, Tensor]]
 
 
@@ -86,14 +87,14 @@ def render_billboards(
     _check_tensors(means, quats, half_extents, features, alpha, viewmat, K)
     _check_options(width, height, near, alpha_min, alpha_max, t_min, low_pass)
     queue = parse_order(order)
-    blend = _backend(backend, alpha.device)
+    project, blend = _backend(backend, means, quats, half_extents)
     settings = BlendSettings(width, height, queue, near, alpha_min, alpha_max, t_min, texture_support(alpha.shape[-1]))
     batched = viewmat.ndim == 3 or K.ndim == 3
     cameras = max(viewmat.shape[0] if viewmat.ndim == 3 else 1, K.shape[0] if K.ndim == 3 else 1)
     views, intrinsics = viewmat.expand(cameras, 4, 4), K.expand(cameras, 3, 3)
     images = []
     for view, intrinsic in zip(views, intrinsics, strict=True):
-        projection = project_billboards(
+        projection = project(
             means, quats, half_extents, view, intrinsic, near=near, low_pass=low_pass, support=settings.support
         )
         rank = canonical_rank(projection.depth, means, quats, half_extents, features, alpha)
@@ -104,21 +105,25 @@ def render_billboards(
     return torch.stack([image for image, _ in images]), torch.stack([opacity for _, opacity in images])
 
 
-def _backend(name: str, device: torch.device) -> _Blend:
+def _backend(name: str, *poses: Tensor) -> tuple[_Project, _Blend]:
+    """Projection and blending for the device of the billboards' poses."""
+    device = poses[0].device
     if name not in _BACKENDS:
         raise DataError.of(_WHERE, "backend", expected=f"one of {', '.join(_BACKENDS)}", found=repr(name))
     if name == "auto":
         name = device.type if device.type in ("cpu", "cuda") else "reference"
     if name == "reference":
-        return blend_reference
+        return project_billboards, blend_reference
     if name == "cpu" and device.type == "cpu":
         from nbavatar.raster.cpu import blend_cpu  # Numba is loaded only when it is needed
+        from nbavatar.raster.cpu_projection import project_billboards_cpu
 
-        return blend_cpu
+        tracked = torch.is_grad_enabled() and any(pose.requires_grad for pose in poses)
+        return project_billboards if tracked else project_billboards_cpu, blend_cpu
     if name == "cuda" and (device.type == "cuda" or os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"):
         from nbavatar.raster.cuda import blend_cuda  # a machine without CUDA never gets here
 
-        return blend_cuda
+        return project_billboards, blend_cuda
     raise DeviceError.of(_WHERE, "backend", expected=f"tensors on {name}", found=f"tensors on {device.type}")
 
 

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Projection", "project_billboards", "texture_support"]
+__all__ = ["FADE_FLOOR", "Projection", "project_billboards", "texture_support"]
 
-_FADE_FLOOR = 1e-6  # a billboard that the low-pass dims below this is as good as edge-on
+FADE_FLOOR = 1e-6  # a billboard that the low-pass dims below this is as good as edge-on
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def project_billboards(
     plane = torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     with torch.no_grad():
-        visible = facing & (fade > _FADE_FLOOR)
+        visible = facing & (fade > FADE_FLOOR)
         bounds, nearest = _bounds(c, au, av, near, support, (fx, skew, cx, fy, cy))
         if squeeze is not None:
             bounds = _stretch(bounds, (x0, y0), squeeze)

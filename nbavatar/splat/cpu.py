@@ -14,10 +14,10 @@ from torch import Tensor
 
 from nbavatar.raster import binning
 from nbavatar.raster.compile import run_workers
+from nbavatar.raster.lanes import LANES
 from nbavatar.splat import cpu_kernels
 from nbavatar.splat.autograd import blend_scene
 from nbavatar.splat.compile import prepare
-from nbavatar.splat.lanes import LANES
 from nbavatar.splat.patches import patches_of
 from nbavatar.splat.projection import FAINTEST, Projection, support_box
 from nbavatar.splat.reference import SplatSettings

@@ -13,24 +13,28 @@ kernel adds those of a Gaussian up in a fixed order. Results do not depend on th
 import numpy as np
 
 from nbavatar.raster.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
+from nbavatar.raster.lanes import (
+    LANES,
+    bits,
+    choose,
+    count_bits,
+    first_lanes,
+    load,
+    minimum,
+    ramp,
+    spread,
+    store,
+    total,
+)  # fmt: skip
 from nbavatar.raster.memory import fetch_add, get, pointer, put
 from nbavatar.splat.compile import inlined, kernel
-from nbavatar.splat.lanes import LANES, bits, choose, falloff, first_lanes, load, minimum, ramp, spread, store, total
+from nbavatar.splat.lanes import falloff
 
 __all__ = ["CHUNKS", "PARTS", "gather_parts", "traverse"]
 
 CHUNKS = TILE_WIDTH // LANES  # of a row of a tile, at most
 PARTS = 9  # sums that a tile leaves for a Gaussian
 _SLACK = 0.01  # pixels by which spans are widened; an alpha decides by itself
-
-
-@inlined
-def _count_bits(word):
-    count = 0
-    while word != 0:
-        word &= word - 1
-        count += 1
-    return count
 
 
 @inlined
@@ -133,11 +137,11 @@ def traverse(turn, tiles, start, members_, record_, box, colours_, limits_, shap
                         finished = bits(hit) ^ word
                         store(real, at, choose(hit, choose(blended, after, nothing - through), through))
                         if finished != 0:
-                            active -= _count_bits(finished)
+                            active -= count_bits(finished)
                         if word == 0:
                             continue
                         if replay:
-                            hits += _count_bits(word)
+                            hits += count_bits(word)
                             note = notes + 2 * LANES * count
                             store(real, note, through)
                             store(real, note + LANES, choose(blended, raw, nothing))

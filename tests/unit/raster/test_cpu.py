@@ -155,6 +155,14 @@ def test_layers_that_interleave_overflow_the_queues_and_stay_exact():
     compare(scene, *camera(20, 18), 20, 18, alpha_min=0.0)
 
 
+def test_hundreds_of_hits_that_wait_at_a_pixel_are_blended_in_order():
+    """Faint billboards, each on a few pixels, in a thick layer: queues fill, are emptied in part and fill again."""
+    scene = random_billboards(22, 4000, 2, 2, torch.float32, 0.05, (0.03, 0.05))
+    scene[0][:, 2] += torch.linspace(0.0, 0.6, 4000)
+    scene[4] *= 0.05
+    compare(scene, *camera(8, 7), 8, 7, t_min=0.0, alpha_min=1e-4, most_flips=0.5)
+
+
 def test_alpha_of_zero_and_one():
     scene = random_billboards(15, 30, 4, 3, torch.float32)
     scene[4] = (scene[4] > 0.5).float()
