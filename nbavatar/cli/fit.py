@@ -45,6 +45,8 @@ from nbavatar.provenance import run_record
 __all__ = ["add_arguments", "main"]
 
 _MATTE_THRESHOLD = 127
+# A share of keypoints off the fitted mesh above which the fit itself is in doubt.
+_UNEXPLAINED = 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -145,6 +147,12 @@ def _tell(part: str, summary: dict[str, Any]) -> None:
     before, after = summary["median_px_before"], summary["median_px_after"]
     if before is not None and after is not None:
         print(f"{part}: median keypoint error {before:.2f} -> {after:.2f} px in {len(summary['cameras'])} cameras")
+    if (summary["unexplained_after"] or 0.0) > _UNEXPLAINED:
+        print(
+            f"nbavatar fit: warning: {summary['unexplained_after']:.0%} of keypoints.{part} are far from the fitted "
+            "mesh: check the calibration, and that cameras and keypoints belong together",
+            file=sys.stderr,
+        )
     found = summary.get("handedness", {})
     if found and found["found"] in (found["expected"], "undecided"):
         said = "as said" if found["found"] == found["expected"] else "undecided"
