@@ -32,6 +32,41 @@ def is_closed(faces: np.ndarray, count: int) -> bool:
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _meets_box(bounds, k, p0, p1, p2, d0, d1, d2, far, margin, slack):
+    """Whether p + t d for t from 0 to `far` comes into box k, grown by `margin` [m], or misses it by `slack` in t."""
+    near = 0.0
+    for c in range(3):
+        p, d = (p0, p1, p2)[c], (d0, d1, d2)[c]
+        low, high = bounds[k, c] - margin, bounds[k, 3 + c] + margin
+        if d == 0.0:
+            if p < low or p > high:
+                return False
+        else:
+            a, b = (low - p) / d, (high - p) / d
+            near, far = max(near, min(a, b)), min(far, max(a, b))
+    return near <= far + slack
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _cross(verts, faces, f, p0, p1, p2, d0, d1, d2):
+    """Where p + t d meets the plane of face f.
+
+    Returns:
+        d . n (n the face's normal times twice its area), t d . n, n . n, and the weights of the second and third corner
+        (Moeller and Trumbore 1997), not finite where d . n is 0.
+    """
+    a, b, c = verts[faces[f, 0]], verts[faces[f, 1]], verts[faces[f, 2]]
+    e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    g0, g1, g2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    n0, n1, n2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
+    facing = d0 * n0 + d1 * n1 + d2 * n2
+    s0, s1, s2 = a[0] - p0, a[1] - p1, a[2] - p2
+    r0, r1, r2 = s1 * d2 - s2 * d1, s2 * d0 - s0 * d2, s0 * d1 - s1 * d0
+    wb, wc = (g0 * r0 + g1 * r1 + g2 * r2) / facing, -(e0 * r0 + e1 * r1 + e2 * r2) / facing
+    return facing, s0 * n0 + s1 * n1 + s2 * n2, n0 * n0 + n1 * n1 + n2 * n2, wb, wc
+
+
+@numba.njit(cache=True, error_model="numpy")
 def crossings(points, verts, faces, nodes, bounds):
     """Signed number of faces that a ray from each point (P, 3) [m] leaves through, away from the middle of the mesh.
 
@@ -57,40 +92,20 @@ def crossings(points, verts, faces, nodes, bounds):
         while top > 0:
             top -= 1
             k = stack[top]
-            near, far = 0.0, np.inf
-            for c in range(3):
-                p, d = (p0, p1, p2)[c], (d0, d1, d2)[c]
-                low, high = bounds[k, c] - 1e-9 * size, bounds[k, 3 + c] + 1e-9 * size
-                if d == 0.0:
-                    if p < low or p > high:
-                        far = -1.0
-                else:
-                    a, b = (low - p) / d, (high - p) / d
-                    near, far = max(near, min(a, b)), min(far, max(a, b))
-            if near > far:
+            if not _meets_box(bounds, k, p0, p1, p2, d0, d1, d2, np.inf, 1e-9 * size, 0.0):
                 continue
             if nodes[k, 2] >= 0:
                 stack[top], stack[top + 1] = nodes[k, 2], nodes[k, 3]
                 top += 2
                 continue
             for f in range(nodes[k, 0], nodes[k, 0] + nodes[k, 1]):
-                a, b, c = verts[faces[f, 0]], verts[faces[f, 1]], verts[faces[f, 2]]
-                e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-                g0, g1, g2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-                n0, n1, n2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
-                facing = d0 * n0 + d1 * n1 + d2 * n2
-                s0, s1, s2 = a[0] - p0, a[1] - p1, a[2] - p2
-                height = s0 * n0 + s1 * n1 + s2 * n2
-                area = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+                facing, height, square, wb, wc = _cross(verts, faces, f, p0, p1, p2, d0, d1, d2)
+                area = math.sqrt(square)
                 if abs(facing) <= _EDGE * area:
                     # Seen edge on: it counts for nothing unless the ray lies in its plane.
                     if area > 0.0 and abs(height) <= _EDGE * area * size:
                         result[i] = np.nan
                     continue
-                # Scaled triple products with (p - a) x d: weights of corners b and c (Moeller and Trumbore 1997).
-                r0, r1, r2 = s1 * d2 - s2 * d1, s2 * d0 - s0 * d2, s0 * d1 - s1 * d0
-                wb = (g0 * r0 + g1 * r1 + g2 * r2) / facing
-                wc = -(e0 * r0 + e1 * r1 + e2 * r2) / facing
                 wa = 1.0 - wb - wc
                 t = height / facing
                 least = min(wa, wb, wc)
@@ -125,34 +140,17 @@ def inner_middles(points, edges, verts, faces, nodes, bounds):
         while top > 0:
             top -= 1
             k = stack[top]
-            near, far = 0.0, 1.0
-            for c in range(3):
-                d = q[c] - p[c]
-                if d == 0.0:
-                    if p[c] < bounds[k, c] or p[c] > bounds[k, 3 + c]:
-                        far = -1.0
-                else:
-                    a, b = (bounds[k, c] - p[c]) / d, (bounds[k, 3 + c] - p[c]) / d
-                    near, far = max(near, min(a, b)), min(far, max(a, b))
-            if near > far + _EDGE:
+            if not _meets_box(bounds, k, p[0], p[1], p[2], d0, d1, d2, 1.0, 0.0, _EDGE):
                 continue
             if nodes[k, 2] >= 0:
                 stack[top], stack[top + 1] = nodes[k, 2], nodes[k, 3]
                 top += 2
                 continue
             for f in range(nodes[k, 0], nodes[k, 0] + nodes[k, 1]):
-                a, b, c = verts[faces[f, 0]], verts[faces[f, 1]], verts[faces[f, 2]]
-                e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-                g0, g1, g2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-                n0, n1, n2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
-                facing = d0 * n0 + d1 * n1 + d2 * n2
+                facing, height, _, wb, wc = _cross(verts, faces, f, p[0], p[1], p[2], d0, d1, d2)
                 if facing == 0.0:
                     continue
-                s0, s1, s2 = a[0] - p[0], a[1] - p[1], a[2] - p[2]
-                r0, r1, r2 = s1 * d2 - s2 * d1, s2 * d0 - s0 * d2, s0 * d1 - s1 * d0
-                wb = (g0 * r0 + g1 * r1 + g2 * r2) / facing
-                wc = -(e0 * r0 + e1 * r1 + e2 * r2) / facing
-                t = (s0 * n0 + s1 * n1 + s2 * n2) / facing
+                t = height / facing
                 if min(1.0 - wb - wc, wb, wc) < -_EDGE or t < 0.0 or t > 1.0:
                     continue
                 # A crossing on an edge of the surface is met once for each of its two faces.
