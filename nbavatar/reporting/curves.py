@@ -2,11 +2,11 @@
 
 import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["PALETTE", "Curve", "line_chart", "thin", "ticks", "training_curves", "widened"]
+__all__ = ["PALETTE", "Curve", "legend_columns", "line_chart", "thin", "ticks", "training_curves", "widened"]
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision; dashes tell series apart beyond its length.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8A7F00")
@@ -111,7 +111,8 @@ def line_chart(title: str, series: Series, *, x_label: str, y_label: str, log_y:
     ys = [y for points in drawn.values() for _, y in points]
     x_range = widened(min(xs), max(xs))
     y_range = widened(min(ys), max(ys))
-    rows = math.ceil(len(drawn) / 3)
+    columns = legend_columns(drawn, 3, 25)
+    rows = math.ceil(len(drawn) / columns)
     height = _HEIGHT + 16 * rows
     bottom = _HEIGHT - _BOTTOM
 
@@ -149,10 +150,17 @@ def line_chart(title: str, series: Series, *, x_label: str, y_label: str, log_y:
             x, y = place(*points[0])
             parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colour}"/>')
         parts.append(f'<path class="line" {style} d="M{path}"><title>{html.escape(name)}</title></path>')
-        x0, y0 = 8 + (number % 3) * (_WIDTH - 8) / 3, _HEIGHT + 4 + 16 * (number // 3)
+        x0, y0 = 8 + (number % columns) * (_WIDTH - 8) / columns, _HEIGHT + 4 + 16 * (number // columns)
         parts.append(f'<path class="line" {style} d="M{x0:.0f} {y0 - 4}h20"/>')
         parts.append(f'<text x="{x0 + 25:.0f}" y="{y0}">{html.escape(name)}</text>')
     return "\n".join([*parts, "</svg>"])
+
+
+def legend_columns(names: Iterable[str], most: int, mark: int) -> int:
+    """Columns of a legend in which the longest name fits beside a mark of a width [px]; at most ``most``."""
+    # A letter of a sans-serif face of 11 px takes 6 px on average.
+    longest = max((len(name) for name in names), default=0)
+    return max(1, min(most, int((_WIDTH - 8) / (mark + 6.2 * longest + 6))))
 
 
 def _drawable(points: Sequence[tuple[float, float]], log_y: bool) -> list[tuple[float, float]]:

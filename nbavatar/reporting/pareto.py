@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from nbavatar.reporting.curves import PALETTE, ticks, widened
+from nbavatar.reporting.curves import PALETTE, legend_columns, ticks, widened
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -156,7 +156,8 @@ def scatter_chart(measured: Sequence[Measured], cost: str, quality: str) -> str:
     front = pareto_front([(x, y) for _, x, y in named], higher_is_better=higher)
     x_range = _padded([x for _, x, _ in named])
     y_range = _padded([y for *_, y in named])
-    rows = -(-len(named) // 4)
+    columns = legend_columns([f"{len(named)} {variant}" for variant, *_ in named], 4, 12)
+    rows = -(-len(named) // columns)
     bottom = _HEIGHT - _BOTTOM
 
     def place(x: float, y: float) -> tuple[float, float]:
@@ -198,7 +199,7 @@ def scatter_chart(measured: Sequence[Measured], cost: str, quality: str) -> str:
         parts.append(
             f'<text x="{px + (6 if right else -6):.1f}" y="{py - 5:.1f}" text-anchor="{anchor}">{number + 1}</text>'
         )
-        lx, ly = 8 + (number % 4) * (_WIDTH - 8) / 4, _HEIGHT + 4 + 16 * (number // 4)
+        lx, ly = 8 + (number % columns) * (_WIDTH - 8) / columns, _HEIGHT + 4 + 16 * (number // columns)
         parts.append(f'<circle cx="{lx + 4:.0f}" cy="{ly - 4}" r="4" fill="{colour}"/>')
         parts.append(f'<text x="{lx + 12:.0f}" y="{ly}">{number + 1} {name}</text>')
     return "\n".join([*parts, "</svg>"])
