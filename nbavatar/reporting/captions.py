@@ -94,7 +94,7 @@ def describe_deviations(
     layout: TableLayout, panel: Panel, printed: Mapping[tuple[str, str, str], Printed]
 ) -> list[str]:
     """Where means and marks that are recomputed from the paper's printed cells differ from what it prints."""
-    if layout.kind == "cameras":
+    if layout.kind == "cameras" or not panel.reported:
         return []
     place = f" ({panel.title})" if panel.title else ""
     sentences = []

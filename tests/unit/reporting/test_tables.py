@@ -252,8 +252,15 @@ def test_capture_layout_takes_whatever_subjects_there_are(tmp_path):
     paths = [evaluation(tmp_path, s, "full", "nv1024", 300, name="nv") for s in ("me", "you")]
     cells, markdown, _ = make(tmp_path, "novel_view", paths, layout=str(ROOT / "config/capture/tables.yaml"))
     assert {key[1] for key in cells} == {"reproduced"}
-    assert "paper" not in markdown.partition("Sources")[0]
+    assert not re.search("paper|[Pp]rinted", markdown.partition("Sources")[0])
     assert [c["text"] for key, c in cells.items() if key[3] == "mean.psnr"] == ["25.00"]
+
+
+def test_a_captures_speed_table_shows_every_stage(tmp_path):
+    stages = ("raster_rgb", "raster", "renderer_fp32", "renderer_bf16", "total_bf16")
+    path = timing(tmp_path, "me", "full", 256, **dict.fromkeys(stages, 2.0))
+    cells, _, _ = make(tmp_path, "speed", [], [path], layout=str(ROOT / "config/capture/tables.yaml"))
+    assert [c["text"] for key, c in cells.items() if key[3].endswith("ms")] == ["2.0"] * 5
 
 
 @pytest.mark.parametrize("table", TABLES)
