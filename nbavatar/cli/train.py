@@ -85,6 +85,7 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     import torch
 
     from nbavatar.avatar.storage import save_avatar
+    from nbavatar.avatar.model import Avatar
     from nbavatar.data.sequences import read_sequence
     from nbavatar.data.views import ViewStore, views_of
     from nbavatar.io.framepack import FramePack
@@ -121,12 +122,12 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     )
     bar.close()
     if summary["finished"]:
-        if config.prune_margin is not None and config.method == "billboards":
+        if config.prune_margin is not None and isinstance(avatar, Avatar):
             from nbavatar.tradeoff.prune import prune
 
             avatar = prune(avatar, meshes, views, margin=config.prune_margin, most_views=_SAMPLED_VIEWS)
             summary["primitives"] = avatar.primitives
-        if config.texture_density is not None and config.method == "billboards":
+        if config.texture_density is not None and isinstance(avatar, Avatar):
             from nbavatar.tradeoff.footprint import largest_footprints, texels_of
             from nbavatar.tradeoff.reduce import size_textures
 

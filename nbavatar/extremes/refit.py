@@ -195,7 +195,8 @@ def _fit(
     smooth = torch.tensor([(math.radians(2.0)) ** -2] * 3 + [0.003**-2] * 3 + [0.5**-2], dtype=torch.float64)
     prior = Prior(zero.expand(_FRAMES, 1), torch.eye(1, dtype=torch.float64), zero, 1.0, smooth, whole)
     arrays = (np.where(confidence[..., None] > 0, pixels, 0.0), confidence, found.inliers, K, views)
-    seen = Observations(*(torch.tensor(a) for a in arrays))
+    observed, weight, inliers, intrinsics, poses = (torch.tensor(a) for a in arrays)
+    seen = Observations(observed, weight, inliers, intrinsics, poses)
     floor = FitConfig().noise_floor_px
     return refine(_BODY, given, prior, seen, threshold=_THRESHOLD, iterations=60, noise_floor=floor)[0], seen
 

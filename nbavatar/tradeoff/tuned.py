@@ -227,7 +227,7 @@ class TunedAvatar:
             small, inner = self._inner(K, width, height)
             posed, box = None, None
             if scene is not None:
-                posed, _ = scene.avatar.pose(verts, frame)
+                posed = scene.avatar.pose(verts, frame)[0]
                 self.work.posed += len(posed.means)
                 box = visible_box(posed, viewmat, inner, *small)
             _lap(laps, "pose")
