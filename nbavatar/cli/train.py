@@ -84,8 +84,8 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     # torch is imported after the device has been leased.
     import torch
 
-    from nbavatar.avatar.storage import save_avatar
     from nbavatar.avatar.model import Avatar
+    from nbavatar.avatar.storage import save_avatar
     from nbavatar.data.sequences import read_sequence
     from nbavatar.data.views import ViewStore, views_of
     from nbavatar.io.framepack import FramePack
