@@ -25,7 +25,7 @@ while [ $# -gt 0 ]; do
     "deform --table") make "$2" ;;
     *" --out"|*" --csv"|*" --sheet"|*" --exr"|*" --picture"|*" --history"|*" --validate") make "$2" ;;
     "figure --out-stem") for s in png pdf json; do make "$2.$s"; done ;;
-    *" --out-stem") for s in csv md tex; do make "$2.$s"; done ;;
+    *" --out-stem") for s in csv md tex html; do make "$2.$s"; done ;;
   esac
   shift
 done
