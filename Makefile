@@ -7,8 +7,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
-# The environment's own `nbavatar`, also where another environment is active.
-IN_VENV := PATH="$(CURDIR)/$(BIN):$$PATH"
 CAPTURE ?=
 
 .PHONY: install smoke capture paper test test-fast bench lint format ci clean help
@@ -30,17 +28,17 @@ $(STAMP): requirements.lock pyproject.toml
 	@touch $(STAMP)
 
 smoke: install  ## the whole pipeline on a tiny synthetic subject, then the tables
-	$(IN_VENV) $(BIN)/nbavatar warm -- $(SNAKEMAKE) --workflow-profile profiles/ci --configfile config/smoke.yaml
+	$(BIN)/nbavatar warm -- $(SNAKEMAKE) --workflow-profile profiles/ci --configfile config/smoke.yaml
 	@cat results/smoke/tables/*.md
 	@echo "report: results/smoke/report/index.html"
 
 capture: install  ## train and evaluate on your own capture: make capture CAPTURE=/path/to/folder
 	@test -n "$(CAPTURE)" || { echo "say which capture: make capture CAPTURE=/path/to/folder"; exit 2; }
-	$(IN_VENV) $(SNAKEMAKE) --configfile config/capture.yaml --config data_root="$(CAPTURE)"
+	$(SNAKEMAKE) --configfile config/capture.yaml --config data_root="$(CAPTURE)"
 
 paper: install  ## every table of the paper; needs the Decaf dataset and the body models
 	$(BIN)/nbavatar check --layout decaf resources/DecafDataset
-	$(IN_VENV) $(SNAKEMAKE) --configfile config/paper.yaml
+	$(SNAKEMAKE) --configfile config/paper.yaml
 
 # One thread a worker: two tests side by side are faster than one after the other on two threads.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES) --dist loadfile

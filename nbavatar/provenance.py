@@ -50,6 +50,8 @@ DYNAMIC: dict[str, tuple[str, ...]] = {
         "nbavatar.extremes.distance",
         "nbavatar.extremes.walking",
         "nbavatar.extremes.physics",
+        "nbavatar.extremes.skinning",
+        "nbavatar.extremes.refit",
         "nbavatar.extremes.triangulation",
         "nbavatar.extremes.distortion",
         "nbavatar.extremes.image",
@@ -177,7 +179,8 @@ def _tree(module: str) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 
 
-def _imports(module: str) -> set[str]:
+@functools.cache
+def _imports(module: str) -> frozenset[str]:
     names: set[str] = set()
     queue: list[ast.AST] = [_tree(module)]
     while queue:
@@ -192,7 +195,7 @@ def _imports(module: str) -> set[str]:
             inner = getattr(node, block, None)
             if isinstance(inner, list):
                 queue.extend(inner)
-    return {name for name in names if name == _PACKAGE or name.startswith(_PACKAGE + ".")}
+    return frozenset(name for name in names if name == _PACKAGE or name.startswith(_PACKAGE + "."))
 
 
 @functools.cache

@@ -10,7 +10,6 @@ import time
 
 import numpy as np
 
-from nbavatar.config.core import to_mapping
 from nbavatar.config.geometry import DeformConfig
 from nbavatar.data.sequences import read_sequence
 from nbavatar.mesh.bvh import DeformingMesh
@@ -33,8 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> dict[str, float | int]:
     """Measures; the first frames compile the kernels and are not counted."""
     config = DeformConfig()
-    own = ("stiffness", "modulus", "uniform_thickness", "picture_size")
-    numbers = ContactNumbers(**{k: v for k, v in to_mapping(config).items() if k not in own})
+    numbers = ContactNumbers(**config.contact_numbers())
     if args.meshes:
         sequence, _ = read_sequence(args.meshes)
         names = [name for name in sequence.parts if name != "head"]

@@ -155,8 +155,7 @@ def _bed(sequence: MeshSequence, cfg: DeformConfig, where: str) -> tuple[np.ndar
 def _solver(sequence: MeshSequence, hands: list[str], bed: np.ndarray, cfg: DeformConfig) -> ContactSolver:
     head = sequence.parts["head"]
     rest = head.rest.astype(np.float64)
-    own = ("stiffness", "modulus", "uniform_thickness", "picture_size")
-    numbers = ContactNumbers(**{key: value for key, value in to_mapping(cfg).items() if key not in own})
+    numbers = ContactNumbers(**cfg.contact_numbers())
     parts = [(sequence.parts[name].rest.astype(np.float64), sequence.parts[name].faces) for name in hands]
     return ContactSolver(soft_surface(rest, head.faces, bed), rest, parts, numbers)
 

@@ -1,8 +1,9 @@
 """Options of the geometry stages: refit, spectral coordinates, contact deformation."""
 
 import dataclasses
+from typing import Any
 
-from nbavatar.config.core import option
+from nbavatar.config.core import option, to_mapping
 
 __all__ = ["DeformConfig", "FitConfig", "SpectralConfig"]
 
@@ -103,3 +104,8 @@ class DeformConfig:
         True, "Whether only frames and regions that contact reaches are simulated; false simulates everything."
     )
     picture_size: int = option(480, "Side of one view of the validation picture [px].", min=64, max=4096)
+
+    def contact_numbers(self) -> dict[str, Any]:
+        """Arguments of `nbavatar.physics.contact.ContactNumbers`: all but the source of stiffness, and the picture."""
+        own = ("stiffness", "modulus", "uniform_thickness", "picture_size")
+        return {key: value for key, value in to_mapping(self).items() if key not in own}

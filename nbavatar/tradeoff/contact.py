@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nbavatar.config.core import to_mapping
 from nbavatar.config.geometry import DeformConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.mesh.bvh import DeformingMesh
@@ -42,8 +41,7 @@ class ContactScene(NamedTuple):
 
     def solver(self, config: DeformConfig) -> ContactSolver:
         """The solver with other numbers."""
-        known = {field.name for field in dataclasses.fields(ContactNumbers)}
-        numbers = ContactNumbers(**{key: value for key, value in to_mapping(config).items() if key in known})
+        numbers = ContactNumbers(**config.contact_numbers())
         head = self.sequence.parts["head"]
         rest = np.asarray(head.rest, np.float64)
         own = (self.sequence.parts[name] for name in self.hands)

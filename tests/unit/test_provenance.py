@@ -68,6 +68,12 @@ def test_dynamic_modules_exist():
             assert SOURCE.parent.joinpath(*name.split(".")).with_suffix(".py").is_file(), name
 
 
+def test_every_family_of_extremes_is_followed():
+    from nbavatar.extremes.cells import FAMILIES
+
+    assert set(provenance.DYNAMIC["nbavatar.extremes.cells"]) == {f"nbavatar.extremes.{name}" for name in FAMILIES}
+
+
 def test_run_record_is_json_with_all_that_traces_a_number(tmp_path):
     import json
 

@@ -44,9 +44,11 @@ except NBAvatarError as error:
 
 R = f"results/{RUN.run}"
 
-# `.venv/bin/snakemake` works without activating the environment: its commands are then found beside it.
-if shutil.which("nbavatar") is None:
-    shell.prefix(f'export PATH="{Path(sys.executable).parent}:$PATH"; ')
+# `.venv/bin/snakemake` works without activating its environment, also where another one is active: its commands are
+# then found beside it.
+BESIDE = Path(sys.executable).parent
+if shutil.which("snakemake") != str(BESIDE / "snakemake"):
+    shell.prefix(f'export PATH="{BESIDE}:$PATH"; ')
 
 
 wildcard_constraints:

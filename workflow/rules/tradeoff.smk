@@ -38,46 +38,32 @@ rule tradeoff:
         mem="16GB",
         runtime="8h",
     params:
+        what="--no-store",
         device=RUN.device,
         folder=lambda w, output: Path(output.result).parent,
         protocol=lambda w: protocol_text(RUN.tradeoff.protocol),
         side=RUN.tradeoff.side,
         code=code_digest("tradeoff"),
     shell:
-        "nbavatar tradeoff --model {input.model} --meshes {input.meshes} --frames {input.frames}"
+        "nbavatar tradeoff {params.what} --model {input.model} --meshes {input.meshes} --frames {input.frames}"
         " --train-frames {input.train} --protocol {params.protocol:q} --sheet {input.sheet} --side {params.side}"
-        " --out {params.folder} --no-store --device {params.device} > {log} 2>&1"
+        " --out {params.folder} --device {params.device} > {log} 2>&1"
 
 
 # Every switch of "only what a scene requires", on and off.
-rule savings:
-    input:
-        model="results/{run}/train/{subject}/{variant}/model.pt",
-        meshes=meshes_of,
-        frames=lambda w: frames_under(RUN.tradeoff.protocol, w.subject),
-        train=train_frames,
-        sheet=RUN.tradeoff.sheet,
+use rule tradeoff as savings with:
     output:
         result="results/{run}/tradeoff/{subject}/{variant}/savings.json",
         rows="results/{run}/tradeoff/{subject}/{variant}/savings.csv",
         table="results/{run}/tradeoff/{subject}/{variant}/savings.md",
     log:
         "logs/{run}/tradeoff/{subject}/{variant}.savings.log",
-    threads: workflow.resource_settings.cores or 4
     resources:
         gpu=1,
         mem="16GB",
         runtime="2h",
     params:
-        device=RUN.device,
-        folder=lambda w, output: Path(output.result).parent,
-        protocol=lambda w: protocol_text(RUN.tradeoff.protocol),
-        side=RUN.tradeoff.side,
-        code=code_digest("tradeoff"),
-    shell:
-        "nbavatar tradeoff --savings --model {input.model} --meshes {input.meshes} --frames {input.frames}"
-        " --train-frames {input.train} --protocol {params.protocol:q} --sheet {input.sheet} --side {params.side}"
-        " --out {params.folder} --device {params.device} > {log} 2>&1"
+        what="--savings",
 
 
 # The stages before training: what their knobs cost in time, and in millimetres.
