@@ -78,3 +78,14 @@ class Refinement(nn.Module):
             turn = axis_angle_to_matrix(self.get_parameter(f"turn_{part}")[row])
             moved = (moved - centre) @ turn.T + centre + self.get_parameter(f"shift_{part}")[row]
         return moved, penalty
+
+    @torch.no_grad()
+    def centre(self) -> None:
+        """Take what all frames have in common out of the refinement.
+
+        A motion shared by every frame is no error of one frame's fit, and the billboards can follow it: without this
+        the avatar drifts off its meshes, and frames without refinement are rendered where it no longer is. So a
+        sequence of one frame is not refined.
+        """
+        for values in self.parameters():
+            values -= values.mean(0)

@@ -30,7 +30,7 @@ def tradeoff_section(result: Mapping[str, Any], table: str) -> Section:
         table: text of `points.md`.
     """
     where = f"{result['device']}, {result['size'][0]}x{result['size'][1]} px, {result['images']} held-out images"
-    if result["frames"] != result["size"]:
+    if result.get("frames", result["size"]) != result["size"]:
         where += f", which are {result['frames'][0]}x{result['frames'][1]} px, as are the pictures that they judge"
     presets = [f"**{name}**: {entry['label']}. {entry['why']}." for name, entry in result["presets"].items()]
     figures = [

@@ -81,6 +81,8 @@ class BillboardTraining(Method):
         """See `Method.after_step`."""
         if self.offsets is not None:
             self.offsets.apply()
+        if self.avatar.refinement is not None:
+            self.avatar.refinement.centre()
 
 
 def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]]:

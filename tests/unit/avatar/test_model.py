@@ -160,6 +160,17 @@ def test_half_precision_stays_near() -> None:
     assert (exact - near).abs().mean() < 0.02
 
 
+def test_refinement_is_centred_over_its_frames() -> None:
+    basis = {part: torch.randn(len(v), 2) for part, v in VERTS.items()}
+    refinement = Refinement(["a", "b"], basis, rigid=True)
+    with torch.no_grad():
+        refinement.get_parameter("shift_head")[:] = torch.tensor([[0.0, 0.1, 0.0], [0.0, 0.3, 0.0]])
+    refinement.centre()
+    for frame, shift in (("a", -0.1), ("b", 0.1)):
+        moved = refinement("head", VERTS["head"], frame)[0]
+        torch.testing.assert_close(moved, VERTS["head"] + torch.tensor([0.0, shift, 0.0]))
+
+
 def test_refinement_leaves_unknown_frames_alone_and_starts_at_zero() -> None:
     basis = {part: torch.randn(len(verts), 3) for part, verts in VERTS.items()}
     refinement = Refinement(["a"], basis, rigid=True)
