@@ -8,7 +8,7 @@ from torch import Tensor
 from nbavatar.avatar.billboards import Posed
 from nbavatar.avatar.model import Avatar
 from nbavatar.data.views import View
-from nbavatar.tradeoff.prune import spread
+from nbavatar.tradeoff.views import posed_views
 
 __all__ = ["footprints", "largest_footprints", "texels_of"]
 
@@ -41,10 +41,7 @@ def largest_footprints(
     device = avatar.faces.device
     largest = torch.zeros(len(avatar.faces), device=device)
     with torch.no_grad():
-        for view in spread(views, most_views):
-            verts = {part: meshes[part][view.row].to(device) for part in avatar.parts}
-            posed, keep = avatar.pose(verts, view.frame)
-            rows = slice(None) if keep is None else keep
+        for view, posed, rows in posed_views(avatar, meshes, views, most_views):
             found = footprints(posed, view.viewmat.to(device), view.K.to(device))
             largest[rows] = torch.maximum(largest[rows], found)
     return largest

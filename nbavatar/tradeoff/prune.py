@@ -17,8 +17,9 @@ from nbavatar.data.views import View
 from nbavatar.errors import DataError
 from nbavatar.tradeoff.contribution import contributions
 from nbavatar.tradeoff.reduce import keep_billboards
+from nbavatar.tradeoff.views import posed_views
 
-__all__ = ["prune", "seen_billboards", "spread", "turned_cameras"]
+__all__ = ["prune", "seen_billboards", "turned_cameras"]
 
 
 def prune(
@@ -51,27 +52,17 @@ def seen_billboards(
     seen = torch.zeros(len(avatar.faces), dtype=torch.bool, device=device)
     with torch.no_grad():
         _, alpha = avatar.textures()
-        for view in spread(views, most_views):
-            verts = {part: meshes[part][view.row].to(device) for part in avatar.parts}
-            posed, keep = avatar.pose(verts, view.frame)
-            if len(posed.means) == 0:
+        for view, posed, rows in posed_views(avatar, meshes, views, most_views):
+            if len(rows) == 0:
                 continue
-            drawn = alpha if keep is None else alpha[keep]
             centre = posed.means.mean(0).cpu()
             for viewmat in turned_cameras(view.viewmat, centre, margin):
                 added = contributions(
-                    posed, drawn, viewmat.to(device), view.K.to(device), view.width, view.height,
+                    posed, alpha[rows], viewmat.to(device), view.K.to(device), view.width, view.height,
                     order=avatar.architecture.order,
                 )  # fmt: skip
-                rows = slice(None) if keep is None else keep
                 seen[rows] |= added > 0
     return seen
-
-
-def spread(views: Sequence[View], most: int) -> list[View]:
-    """At most so many views, evenly spread over all, with the ends."""
-    count = min(most, len(views))
-    return [views[round(i * (len(views) - 1) / max(1, count - 1))] for i in range(count)]
 
 
 def turned_cameras(viewmat: Tensor, centre: Tensor, margin: float) -> list[Tensor]:
