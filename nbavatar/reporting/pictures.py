@@ -7,13 +7,10 @@ error map   mean over RGB of |render - truth|, sRGB in [0, 1], shown from 0 (bla
 import base64
 import io
 from collections.abc import Sequence
-from typing import TypeVar
 
 import numpy as np
 
 __all__ = ["ERROR_MAX", "RAMP", "data_uri", "error_map", "reduce_picture", "spread"]
-
-_T = TypeVar("_T")
 
 ERROR_MAX = 0.25
 # Anchors of the ramp, evenly spaced, sRGB 8 bit; their lightness rises in even steps.
@@ -69,7 +66,7 @@ def data_uri(picture: np.ndarray) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
 
 
-def spread(items: Sequence[_T], count: int) -> list[_T]:
+def spread(items: Sequence[str], count: int) -> list[str]:
     """At most ``count`` of the items, evenly spaced, first and last among them (the middle one if count is 1)."""
     if len(items) <= count:
         return list(items)

@@ -53,12 +53,13 @@ def seen_billboards(
     with torch.no_grad():
         _, alpha = avatar.textures()
         for view, posed, rows in posed_views(avatar, meshes, views, most_views):
-            if len(rows) == 0:
+            if len(posed.means) == 0:
                 continue
+            drawn = alpha[rows]
             centre = posed.means.mean(0).cpu()
             for viewmat in turned_cameras(view.viewmat, centre, margin):
                 added = contributions(
-                    posed, alpha[rows], viewmat.to(device), view.K.to(device), view.width, view.height,
+                    posed, drawn, viewmat.to(device), view.K.to(device), view.width, view.height,
                     order=avatar.architecture.order,
                 )  # fmt: skip
                 seen[rows] |= added > 0

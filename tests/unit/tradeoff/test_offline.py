@@ -6,7 +6,7 @@ import pytest
 from nbavatar.config.tradeoff import OfflineConfig
 from nbavatar.data.sequences import MeshSequence, Part
 from nbavatar.tradeoff.offline import decimate, decimation_rows, spectral_rows
-from nbavatar.tradeoff.section import offline_section
+from nbavatar.tradeoff.section import offline_section, tradeoff_section
 
 
 def sphere(rings: int = 14) -> tuple[np.ndarray, np.ndarray]:
@@ -68,3 +68,13 @@ def test_the_report_names_every_stage(ball) -> None:
     rows = list(spectral_rows(ball, OfflineConfig(spectral_modes=[3])))
     section = offline_section({"rows": rows}, "| table |")
     assert section.paragraphs[0].startswith("Spectral, modes") and " mm in " in section.paragraphs[0]
+
+
+def test_a_sweep_says_which_pictures_judge_where_they_are_smaller():
+    result = {"device": "cpu", "size": [64, 64], "images": 2, "presets": {}, "complete": True, "paragraphs": {}}
+    captions = {
+        key: tradeoff_section(result | more, "| table |").figures[0][1]
+        for key, more in {"older": {}, "same": {"frames": [64, 64]}, "smaller": {"frames": [32, 32]}}.items()
+    }
+    assert captions["older"] == captions["same"] and "32x32" not in captions["same"]
+    assert "32x32 px" in captions["smaller"]

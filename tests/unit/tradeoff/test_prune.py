@@ -65,8 +65,7 @@ def test_a_margin_keeps_more_and_a_sample_of_views_no_more(nested) -> None:
     one, turned = (seen_billboards(avatar, meshes, views[1:2], margin=m, most_views=1) for m in (0.0, 40.0))
     assert (one <= turned).all() and not one[32:].any() and turned[32:].all()
     sample = seen_billboards(avatar, meshes, views, margin=0.0, most_views=1)
-    middle = views[len(views) // 2 :][:1]
-    assert torch.equal(sample, seen_billboards(avatar, meshes, middle, margin=0.0, most_views=9))
+    assert torch.equal(sample, seen_billboards(avatar, meshes, views[:1], margin=0.0, most_views=9))
 
 
 def test_check_parts_refuses_faces_of_another_mesh(nested) -> None:
