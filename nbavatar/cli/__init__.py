@@ -25,6 +25,7 @@ VERBS = {
     "masks": "person matte + meshes -> head and hand labels and coverage",
     "crop": "undistort, crop and resize frames and labels, intrinsics carried along",
     "fit": "multi-view refit of head and hand models",
+    "align": "rigid alignment of a capture's meshes to its pictures",
     "spectral": "spectral coordinates of the meshes",
     "deform": "contact deformation of the head by the hand, cached to NPZ and EXR",
     "train": "train an avatar",

@@ -5,7 +5,7 @@ from typing import Any
 
 from nbavatar.config.core import option, to_mapping
 
-__all__ = ["DeformConfig", "FitConfig", "SpectralConfig"]
+__all__ = ["AlignConfig", "DeformConfig", "FitConfig", "SpectralConfig"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +53,24 @@ class FitConfig:
     sheet_frames: int = option(4, "Frames on the contact sheet.", min=1, max=64)
     sheet_cameras: int = option(4, "Cameras on the contact sheet.", min=1, max=16)
     sheet_tile: int = option(360, "Height of a picture on the contact sheet [px].", min=64, max=2048)
+
+
+@dataclasses.dataclass(frozen=True)
+class AlignConfig:
+    """Rigid alignment of a capture's meshes to its pictures, frame by frame."""
+
+    iterations: int = option(0, "Steps on each of two scales of detail; 0 leaves the stage out.", min=0, max=100)
+    frames: str = option(
+        "all", "Frames that are aligned: all, or only those that are trained on.", choices=("all", "train")
+    )
+    likeness_mm: float = option(
+        10.0, "Frames in which a part lies this far apart still tell its colours, the nearer the more [mm].", min=0.1
+    )
+    shift_mm: float = option(5.0, "Shifts that are expected, about [mm].", min=1.0e-3)
+    turn_deg: float = option(3.0, "Turns that are expected, about [degrees].", min=1.0e-3)
+    block: int = option(32, "Most frames that are aligned together; bounds the memory.", min=2)
+    lines: int = option(512, "Height to which larger pictures are reduced [px].", min=16, max=2160)
+    points: int = option(4000, "Most vertices of a part that are looked at.", min=3)
 
 
 @dataclasses.dataclass(frozen=True)

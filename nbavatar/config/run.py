@@ -11,7 +11,7 @@ from typing import Any
 from nbavatar.config.avatar import SpeedConfig, TrainConfig
 from nbavatar.config.core import from_mapping, merge, option, to_mapping
 from nbavatar.config.evaluation import EvaluateConfig, ProtocolConfig, ReportConfig, TableConfig, VideoConfig
-from nbavatar.config.geometry import DeformConfig, FitConfig, SpectralConfig
+from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, SpectralConfig
 from nbavatar.config.preprocess import CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
 from nbavatar.errors import ConfigError, did_you_mean
@@ -28,6 +28,7 @@ class Stages:
     tracks: TracksConfig = option(TracksConfig, "Reading of parameters, keypoints and meshes.")
     masks: MasksConfig = option(MasksConfig, "Head and hand masks.")
     fit: FitConfig = option(FitConfig, "Multi-view refit.")
+    align: AlignConfig = option(AlignConfig, "Rigid alignment of a capture's meshes to its pictures.")
     spectral: SpectralConfig = option(SpectralConfig, "Spectral coordinates.")
     deform: DeformConfig = option(DeformConfig, "Contact deformation.")
     train: TrainConfig = option(TrainConfig, "Training.")
@@ -44,7 +45,8 @@ class Variant:
 
     crop: str = option("center", "Name of the crop (see `crops`) whose frames it is trained on.")
     meshes: str = option(
-        "deform", "Meshes that carry it: with contact deformation, as refitted, or as delivered.",
+        "deform",
+        "Meshes that carry it: with contact deformation, as refitted (a capture's: as aligned), or as delivered.",
         choices=("deform", "fit", "tracks"),
     )  # fmt: skip
     stages: dict[str, Any] = option({}, "Options that differ from the run's `stages`, by stage.")

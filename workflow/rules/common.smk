@@ -44,6 +44,9 @@ except NBAvatarError as error:
 
 R = f"results/{RUN.run}"
 
+# A capture brings meshes: nothing is refitted, but they may be aligned to its pictures.
+ALIGNED = RUN.layout == "capture" and RUN.stages.align.iterations > 0
+
 # `.venv/bin/snakemake` works without activating its environment, also where another one is active: its commands are
 # then found beside it.
 BESIDE = Path(sys.executable).parent
@@ -188,20 +191,18 @@ def meshes_of(wildcards):
 
 def meshes_for(subject, variant):
     stage = RUN.variants[variant].meshes
-    if RUN.layout == "capture" and (
-        stage == "fit" or RUN.stages.tracks.contact == "given"
-    ):
-        stage = "tracks"
-    return f"{R}/{stage}/{subject}.npz"
+    if stage == "deform" and RUN.layout == "capture":
+        stage = "fit" if RUN.stages.tracks.contact == "given" else stage
+    return fitted_of(subject) if stage == "fit" else f"{R}/{stage}/{subject}.npz"
 
 
 def fitted(wildcards):
-    """Meshes before contact: refitted ones, or those that a capture brings."""
+    """Meshes before contact: refitted ones, or those that a capture brings, aligned or not."""
     return fitted_of(wildcards.subject)
 
 
 def fitted_of(subject):
-    stage = "tracks" if RUN.layout == "capture" else "fit"
+    stage = "fit" if RUN.layout == "decaf" else "align" if ALIGNED else "tracks"
     return f"{R}/{stage}/{subject}.npz"
 
 

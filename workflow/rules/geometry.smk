@@ -1,8 +1,8 @@
-"""Refit, spectral coordinates, contact deformation.
+"""Refit or alignment, spectral coordinates, contact deformation.
 
 REQUIRED INPUTS: results/{run}/tracks/{subject}.npz, results/{run}/ingest/{subject}/*.zip
-OUTPUTS: results/{run}/fit/{subject}.{npz,png}, results/{run}/spectral/{subject}.npz,
-         results/{run}/deform/{subject}.{npz,exr.zip}
+OUTPUTS: results/{run}/fit/{subject}.{npz,png} or results/{run}/align/{subject}.npz,
+         results/{run}/spectral/{subject}.npz, results/{run}/deform/{subject}.{npz,exr.zip}
 """
 
 # A capture brings final meshes: there is nothing to refit.
@@ -41,6 +41,33 @@ if RUN.layout == "decaf":
         shell:
             "nbavatar fit --tracks {input.tracks} --assets {params.assets:q} --frames {input.frames}"
             " --out {output.meshes} --sheet {output.sheet} --cfg {params.cfg:q} > {log} 2>&1"
+
+
+if ALIGNED:
+
+    rule align:
+        input:
+            meshes="results/{run}/tracks/{subject}.npz",
+            frames=lambda w: [
+                f"{R}/ingest/{w.subject}/{c}.zip"
+                for c in SUBJECTS[w.subject].train_cameras
+            ],
+        output:
+            "results/{run}/align/{subject}.npz",
+        log:
+            "logs/{run}/align/{subject}.log",
+        benchmark:
+            "benchmarks/{run}/align/{subject}.jsonl"
+        priority: 10
+        resources:
+            mem="8GB",
+            runtime="4h",
+        params:
+            cfg=options("align"),
+            code=code_digest("align"),
+        shell:
+            "nbavatar align --meshes {input.meshes} --frames {input.frames} --out {output}"
+            " --cfg {params.cfg:q} > {log} 2>&1"
 
 
 rule spectral:

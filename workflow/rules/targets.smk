@@ -25,6 +25,8 @@ def stage_files(stage):
     }
     if RUN.layout == "decaf":
         files["fit"] = [f"{R}/fit/{s}.npz" for s in subjects]
+    if ALIGNED:
+        files["align"] = [f"{R}/align/{s}.npz" for s in subjects]
     return files[stage]
 
 
@@ -52,6 +54,7 @@ for _stage in (
     "masks",
     "crop",
     *(["fit"] if RUN.layout == "decaf" else []),
+    *(["align"] if ALIGNED else []),
     "spectral",
     "deform",
     "train",

@@ -1,0 +1,123 @@
+"""Rigid alignment of a capture's meshes to its pictures: takes a tracker's jitter out, frame by frame.
+
+Reads
+  --meshes   mesh sequence (.npz, `nbavatar tracks`) with camera.<camera>.{K, cam_from_world, distortion, size}
+  --frames   frame packs (.zip, `nbavatar ingest`) of the cameras to use, layer rgb, as recorded; a camera held out for
+             evaluation is left out here and so never looked at
+and writes
+  --out      the mesh sequence with every part moved as a whole in every frame, and its extras head_rigid and head_final
+             with the head; new extras align.<part> float32 [N, 6] (rotation vector about the part's mean [rad],
+             shift [m]), zero where nothing was done
+
+A part has to keep its colours while it moves a little, and to be seen in two frames or more. Errors that all frames
+share stay. Deformation stays too: use the contact stage and the training's `refine` for that. With
+{"frames": "train"} frames held out for self-reenactment keep the meshes they came with.
+"""
+
+import argparse
+import contextlib
+from typing import Any
+
+import numpy as np
+
+from nbavatar.camera.distortion import checked_coefficients
+from nbavatar.camera.pinhole import Camera
+from nbavatar.cli.common import add_cfg_argument, progress, stage_config
+from nbavatar.config.core import to_mapping
+from nbavatar.config.geometry import AlignConfig
+from nbavatar.data.sequences import MeshSequence, Part, read_sequence, write_sequence
+from nbavatar.errors import DataError
+from nbavatar.fitting.align import Motion, align_block, blocks, moved, summary
+from nbavatar.io.framepack import FramePack
+from nbavatar.provenance import run_record
+
+__all__ = ["add_arguments", "main"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the options."""
+    parser.add_argument("--meshes", required=True, metavar="NPZ", help="mesh sequence of `nbavatar tracks`")
+    parser.add_argument("--frames", nargs="+", required=True, metavar="ZIP", help="frame packs of the cameras to use")
+    parser.add_argument("--out", required=True, metavar="NPZ", help="aligned mesh sequence to write")
+    add_cfg_argument(parser, AlignConfig)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Aligns and writes."""
+    cfg = stage_config(args, AlignConfig)
+    sequence, _ = read_sequence(args.meshes)
+    count = len(sequence.frames)
+    found = {part: np.zeros((count, 6)) for part in sequence.parts}
+    motions: dict[str, list[Motion]] = {part: [] for part in sequence.parts}
+    with contextlib.ExitStack() as stack:
+        packs = {str(p.manifest["camera"]): p for p in (stack.enter_context(FramePack(path)) for path in args.frames)}
+        cameras = [_camera(name, pack, sequence, args.meshes) for name, pack in packs.items()]
+        known = {name: set(pack.frames) for name, pack in packs.items()}
+        segments = np.asarray(sequence.extras.get("segments", [[0, count - 1]])).reshape(-1, 2).tolist()
+        pieces = blocks(_rows(sequence, cfg), segments, cfg.block) if cfg.iterations > 0 else []
+        for rows in progress(pieces, "align", len(pieces)):
+            names = [sequence.frames[row] for row in rows]
+
+            def read(camera: str, i: int, names: list[str] = names) -> np.ndarray | None:
+                return packs[camera].read("rgb", names[i]) if names[i] in known[camera] else None
+
+            verts = {part: np.asarray(mesh.verts[rows]) for part, mesh in sequence.parts.items()}
+            faces = {part: mesh.faces for part, mesh in sequence.parts.items()}
+            for part, motion in align_block(verts, faces, cameras, read, cfg).items():
+                found[part][rows] = np.concatenate([motion.turn, motion.shift], axis=1)
+                motions[part].append(motion)
+    report = {part: summary(done) for part, done in motions.items() if done}
+    for part, said in report.items():
+        shift, turn = said["shift_mm"], said["turn_deg"]
+        print(
+            f"{part}: moved {shift[0]:.2f} mm (up to {shift[1]:.2f}), turned {turn[0]:.2f} degrees "
+            f"(up to {turn[1]:.2f})"
+        )
+    aligned = _moved_sequence(sequence, found)
+    inputs = {"meshes": args.meshes} | {f"frames.{i}": path for i, path in enumerate(args.frames)}
+    record = run_record("align", config=to_mapping(cfg), inputs=inputs, extra={"align": report})
+    write_sequence(args.out, aligned, record)
+
+
+def _rows(sequence: MeshSequence, cfg: AlignConfig) -> list[int]:
+    """Frames to align."""
+    if cfg.frames == "all":
+        return list(range(len(sequence.frames)))
+    if "split" not in sequence.extras:
+        raise DataError.of("meshes", "split", expected="which frames are trained on", found="nothing")
+    return np.flatnonzero(np.asarray(sequence.extras["split"]).astype(str) == "train").tolist()
+
+
+def _camera(name: str, pack: FramePack, sequence: MeshSequence, meshes: str) -> Camera:
+    """A camera as the meshes' file describes it."""
+    extras = sequence.extras
+    if f"camera.{name}.K" not in extras:
+        known = sorted(key.split(".")[1] for key in extras if key.startswith("camera.") and key.endswith(".K"))
+        raise DataError.of(meshes, f"camera.{name}", expected=f"camera {name} of {pack.path}", found=", ".join(known))
+    given = extras.get(f"camera.{name}.distortion")
+    distortion = None if given is None or not np.any(given) else checked_coefficients(given, f"{meshes}: {name}")
+    K, pose = (np.asarray(extras[f"camera.{name}.{key}"], np.float64) for key in ("K", "cam_from_world"))
+    return Camera(name, int(pack.manifest["width"]), int(pack.manifest["height"]), K, pose, distortion)
+
+
+def _moved_sequence(sequence: MeshSequence, found: dict[str, np.ndarray]) -> MeshSequence:
+    """The sequence with its parts moved, and the head's other states with it."""
+    parts: dict[str, Part] = {}
+    extras: dict[str, Any] = dict(sequence.extras)
+    for name, part in sequence.parts.items():
+        motion = Motion(found[name][:, :3], found[name][:, 3:], np.nan, np.nan)
+        centre = np.asarray(part.verts, np.float64).mean(1)
+        still = ~found[name].any(1)
+
+        def move(
+            verts: np.ndarray, motion: Motion = motion, centre: np.ndarray = centre, still: np.ndarray = still
+        ) -> np.ndarray:
+            result = moved(verts, motion, centre).astype(np.float32)
+            result[still] = verts[still]  # to the bit
+            return result
+
+        parts[name] = Part(part.faces, part.rest, move(part.verts))
+        extras[f"align.{name}"] = found[name].astype(np.float32)
+        if name == "head":
+            extras |= {key: move(extras[key]) for key in ("head_rigid", "head_final") if key in extras}
+    return MeshSequence(sequence.frames, parts, extras)
