@@ -22,7 +22,7 @@ and writes
   --sheet    picture (.png) with the points over the images: look at it before fitting
 
 Confidence is the network's certainty that there is a face or a hand, for faces times how well the point corresponds to
-a landmark of FLAME (contour 0.3, brows 0.6, others 1) and how far the surface there is turned towards the camera.
+a landmark of FLAME (contour 0.1, brows 0.6, others 1) and how far the surface there is turned towards the camera.
 Where there are no label masks, the network tells right from left hands; images must not be mirrored.
 """
 

@@ -86,7 +86,8 @@ class Detector:
             square = square_of_mesh(face.mesh)
             windows[0].append(Square(square.x, square.y, _REACH * square.side))
         if mask is not None and labels:
-            shown = [mask == value for value in _LABELS.values() if np.count_nonzero(mask == value) >= _LEAST_HAND]
+            every = [np.equal(mask, value) for value in _LABELS.values()]
+            shown: list[np.ndarray] = [hand for hand in every if np.count_nonzero(hand) >= _LEAST_HAND]
             windows, most = [[window for hand in shown for window in mask_window(hand)]], len(shown)
             if not shown:
                 return []
@@ -130,7 +131,7 @@ def keep_parts(
     for part, cameras in keypoints.items():
         seen = {camera: (values[..., 2] > 0).any(1) for camera, values in cameras.items()}
         pairs = int((np.sum(list(seen.values()), axis=0) >= 2).sum())
-        frames = len(next(iter(seen.values())))
+        frames = len(next(iter(cameras.values())))
         keep = pairs > 0 and pairs >= least_share * frames
         report[part] = {
             "frames_in_two_cameras": pairs,
