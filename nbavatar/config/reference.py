@@ -6,6 +6,7 @@ import typing
 from typing import Any
 
 from nbavatar.config.core import json_schema, to_mapping
+from nbavatar.config.detection import DetectConfig
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.config.preprocess import CropConfig
 from nbavatar.config.run import RunConfig, Stages, Variant
@@ -47,6 +48,11 @@ def reference_page() -> str:
     hints = typing.get_type_hints(Stages)
     for field in dataclasses.fields(Stages):
         parts.append(_section(f"`stages.{field.name}`", hints[field.name], note=field.metadata["doc"]))
+    parts.append(
+        _section(
+            "`nbavatar detect --cfg`", DetectConfig, note="Keypoints for captures that bring none; no rule runs it."
+        )
+    )
     parts.append("# Layout of the tables (`tables.yaml`)\n")
     for title, cls in (("`<table>`", TableLayout), ("`<table>.panels[]`", Panel), ("`<table>.rows[]`", TableRow)):
         parts.append(_section(title, cls))

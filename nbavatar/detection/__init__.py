@@ -1,0 +1,1 @@
+"""Keypoints of faces and hands found in images, for captures that bring none."""
