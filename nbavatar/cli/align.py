@@ -53,7 +53,8 @@ def main(args: argparse.Namespace) -> None:
         packs = {str(p.manifest["camera"]): p for p in (stack.enter_context(FramePack(path)) for path in args.frames)}
         cameras = [_camera(name, pack, sequence, args.meshes) for name, pack in packs.items()]
         known = {name: set(pack.frames) for name, pack in packs.items()}
-        segments = np.asarray(sequence.extras.get("segments", [[0, count - 1]])).reshape(-1, 2).tolist()
+        cuts = np.asarray(sequence.extras.get("segments", [[0, count - 1]])).reshape(-1, 2)
+        segments = [(int(first), int(last)) for first, last in cuts]
         pieces = blocks(_rows(sequence, cfg), segments, cfg.block) if cfg.iterations > 0 else []
         for rows in progress(pieces, "align", len(pieces)):
             names = [sequence.frames[row] for row in rows]
@@ -107,7 +108,7 @@ def _moved_sequence(sequence: MeshSequence, found: dict[str, np.ndarray]) -> Mes
     for name, part in sequence.parts.items():
         motion = Motion(found[name][:, :3], found[name][:, 3:], np.nan, np.nan)
         centre = np.asarray(part.verts, np.float64).mean(1)
-        still = ~found[name].any(1)
+        still = np.logical_not(found[name].any(axis=1))
 
         def move(
             verts: np.ndarray, motion: Motion = motion, centre: np.ndarray = centre, still: np.ndarray = still

@@ -94,6 +94,9 @@ class TrainConfig:
     final_rate: float = option(0.05, "Fast: factor on all rates at the end (cosine).", min=0, max=1)
     decay_from: float = option(0.4, "Fast: share of training at which that decay starts.", min=0, max=1)
     rates: RatesConfig = option(RatesConfig, "Learning rates.")
+    texel_sharing: float = option(
+        0.0, "Texels also take the mean gradient of their billboard, so many times; 0 for none, as in the paper.", min=0
+    )
     rate_factor: float = option(1.0, "Factor on every learning rate.", min=0)
     clip: float = option(0.0, "Largest gradient norm of the renderer; 0 = no clipping.", min=0)
     refine: RefineConfig = option(RefineConfig, "Compensation of fitting errors.")

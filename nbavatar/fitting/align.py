@@ -112,7 +112,7 @@ def align_block(
     seen = _visible(verts, faces, cameras, pictures, cfg)
     motions = {}
     for part, points in verts.items():
-        there = np.isfinite(points).all((1, 2))
+        there = np.array([bool(np.isfinite(one).all()) for one in points])
         start = np.where(there[:, None, None], points, 0.0).astype(np.float64)
         chosen = _spread(points.shape[1], cfg.points)
         weight = seen[part][..., chosen] & there[None, :, None]
@@ -268,7 +268,7 @@ def _sample(details: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.nda
     """Bilinear colours (n, P, 3), their change with the pixel (n, P, 3, 2), and whether it lies in the picture."""
     height, width = details.shape[1:3]
     place = np.nan_to_num(pixels, nan=-9.0) - 0.5
-    inside = ((place >= 0) & (place < [width - 1, height - 1])).all(-1)
+    inside = np.asarray(((place >= 0) & (place < [width - 1, height - 1])).all(-1))
     place = np.clip(place, 0, [width - 1.001, height - 1.001])
     cell = np.floor(place).astype(int)
     u, v = np.moveaxis((place - cell)[..., None], -2, 0)

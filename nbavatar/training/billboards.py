@@ -18,7 +18,7 @@ from nbavatar.training.schedule import Plan
 from nbavatar.training.setup import initial_avatar, neighbour_graph
 from nbavatar.training.shape import SmoothOffsets
 
-__all__ = ["BillboardTraining", "parameter_groups"]
+__all__ = ["BillboardTraining", "parameter_groups", "shared_gradient"]
 
 
 class BillboardTraining(Method):
@@ -36,6 +36,9 @@ class BillboardTraining(Method):
     ) -> None:
         super().__init__(avatar, config)
         self.neighbours, self.offsets = neighbours, offsets
+        if config.texel_sharing > 0:
+            for textures in (avatar.billboards.features, avatar.billboards.alpha_logit):
+                textures.register_hook(lambda gradient: shared_gradient(gradient, config.texel_sharing))
 
     @classmethod
     def create(
@@ -83,6 +86,16 @@ class BillboardTraining(Method):
             self.offsets.apply()
         if self.avatar.refinement is not None:
             self.avatar.refinement.centre()
+
+
+def shared_gradient(gradient: Tensor, share: float) -> Tensor:
+    """Gradient of textures (F, T, T, ...) with the mean over each billboard's texels added `share` times.
+
+    Not part of the paper. A view touches few texels of a billboard, so each of them alone learns from few views; what
+    they have in common, the colour of the place, is learnt from all. The direction is still one of descent: the
+    gradient is multiplied by a positive definite matrix.
+    """
+    return gradient + share * gradient.mean((1, 2), keepdim=True)
 
 
 def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]]:
