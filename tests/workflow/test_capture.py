@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nbavatar.data.sequences import read_sequence
+from nbavatar.io.framepack import FramePack
+from nbavatar.provenance import file_digest
 from tests.scenes.capture import write_capture
 
 ROOT = Path(__file__).parents[2]
@@ -43,6 +46,12 @@ def test_a_capture_ends_in_tables_and_a_report(tmp_path: Path) -> None:
     results = project / "results/capture"
     scores = [json.loads((results / f"eval/toy/full/{name}.json").read_text()) for name in ("nv", "sr")]
     assert all(np.isfinite(list(score["metrics"].values())).all() for score in scores)
+    # Meshes are aligned to what the training cameras saw, and to nothing else.
+    _, record = read_sequence(results / "align/toy.npz")
+    cameras = {file_digest(path): path.stem for path in (results / "ingest/toy").glob("*.zip")}
+    looked_at = {cameras[digest] for name, digest in record["inputs"].items() if name.startswith("frames.")}
+    held_out = {name.partition("/")[0] for name in FramePack(results / "render/toy/full/nv.zip").frames}
+    assert len(held_out) == 1 and looked_at == set(cameras.values()) - held_out
     for table in ("novel_view", "self_reenactment", "speed"):
         assert "toy" in (results / f"tables/{table}.csv").read_text() or table == "speed"
     assert "toy" in (results / "report/index.html").read_text()
