@@ -14,6 +14,7 @@ normalisation is left out there, so a 32-pixel image works at depth 5.
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 __all__ = ["UNet", "macs"]
 
@@ -21,11 +22,17 @@ _SLOPE = 0.2
 
 
 class _Norm(nn.InstanceNorm2d):
-    """Instance normalisation that leaves a single-pixel map as it is."""
+    """Instance normalisation that leaves a single-pixel map as it is.
+
+    While training on one picture it is a batch normalisation, the same sums over the same pixels: torch's instance
+    normalisation copies channels-last maps to channels first and back, and a step takes 1.3 to 1.6 times as long.
+    """
 
     def forward(self, input: Tensor) -> Tensor:
         if input.shape[-1] * input.shape[-2] == 1:
             return input
+        if self.training and len(input) == 1:
+            return functional.batch_norm(input, None, None, self.weight, self.bias, training=True, eps=self.eps)
         return super().forward(input)
 
 

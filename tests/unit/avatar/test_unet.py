@@ -55,6 +55,24 @@ def test_unet_is_the_same_in_both_memory_formats() -> None:
         torch.testing.assert_close(a, b, atol=2e-5, rtol=0)
 
 
+def test_unet_normalises_a_picture_alike_in_training_and_rendering() -> None:
+    torch.manual_seed(0)
+    network = UNet(4, width=8, depth=3).to(memory_format=torch.channels_last).double()
+    image = torch.randn(1, 4, 64, 64, dtype=torch.float64)
+
+    def values_and_gradients() -> list[torch.Tensor]:
+        network.zero_grad()
+        colour, opacity = network(image)
+        (colour.square().sum() + opacity.sum()).backward()
+        return [colour.detach(), opacity.detach(), *(p.grad.clone() for p in network.parameters())]
+
+    network.train()
+    training = values_and_gradients()
+    network.eval()
+    for a, b in zip(training, values_and_gradients(), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-9, rtol=1e-9)  # in float64 nothing but the order of sums is left
+
+
 def test_unet_half_precision_stays_near() -> None:
     network = UNet(4, width=8, depth=3).eval()
     image = torch.randn(1, 4, 32, 32)
