@@ -72,11 +72,7 @@ class FaceFinder:
         return None
 
     def _place(self, image: np.ndarray, square: Square) -> Face | None:
-        # Each output costs a pass through the network, so the early rounds are asked for nothing but the mesh.
-        for _ in range(self._rounds - 1):
-            self._mesh.show(image, square)
-            square = square_of_mesh(self._mesh.points(square))
-        score = self._mesh.score(image, square)
+        square, score = self._mesh.place(image, square, square_of_mesh, self._rounds)
         return Face(self._mesh.points(square), score) if score >= self._least else None
 
 

@@ -91,11 +91,7 @@ class HandFinder:
         return sorted(hands, key=lambda hand: -hand.score)[:most]
 
     def _place(self, image: np.ndarray, square: Square) -> Hand | None:
-        # Each output costs a pass through the network, so the early rounds are asked for nothing but the joints.
-        for _ in range(self._rounds - 1):
-            self._joints.show(image, square)
-            square = square_of_joints(self._joints.points(square))
-        score = self._joints.score(image, square)
+        square, score = self._joints.place(image, square, square_of_joints, self._rounds)
         if score < self._least:
             return None
         return Hand(self._joints.points(square), score, self._joints.value("side"))

@@ -1,6 +1,6 @@
 """The four networks, run by OpenCV."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -99,6 +99,21 @@ class Landmarker:
         self.show(image, square)
         value = self.value("score")
         return float(1 / (1 + np.exp(-np.clip(value, -50.0, 50.0)))) if self._logits else value
+
+    def place(
+        self, image: np.ndarray, square: Square, again: Callable[[np.ndarray], Square], rounds: int
+    ) -> tuple[Square, float]:
+        """Shows a square, and then, in all `rounds` times, the one that `again` makes of the points found in it.
+
+        Each output costs a pass through the network, so the early rounds are asked for nothing but the points.
+
+        Returns:
+            the square that was shown last, and its score.
+        """
+        for _ in range(rounds - 1):
+            self.show(image, square)
+            square = again(self.points(square))
+        return square, self.score(image, square)
 
     def value(self, output: str) -> float:
         """A further number about the square that was shown last."""

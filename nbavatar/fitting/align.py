@@ -108,15 +108,16 @@ def align_block(
         part -> motion: zero for frames without the part, and for a part whose colours agree no better for it.
     """
     count = len(next(iter(verts.values())))
-    pictures = {camera.name: [read(camera.name, i) for i in range(count)] for camera in cameras}
+    pictures = {camera.name: [_reduced(read(camera.name, i), camera, cfg) for i in range(count)] for camera in cameras}
     seen = _visible(verts, faces, cameras, pictures, cfg)
+    levels = [[_shot(camera, pictures[camera.name], level, cfg) for camera in cameras] for level in _LEVELS]
     motions = {}
     for part, points in verts.items():
         there = np.array([bool(np.isfinite(one).all()) for one in points])
         start = np.where(there[:, None, None], points, 0.0).astype(np.float64)
         chosen = _spread(points.shape[1], cfg.points)
         weight = seen[part][..., chosen] & there[None, :, None]
-        motions[part] = _align_part(start, chosen, weight, there, cameras, pictures, cfg)
+        motions[part] = _align_part(start, chosen, weight, there, levels, cfg)
     return motions
 
 
@@ -130,38 +131,28 @@ def _align_part(
     chosen: np.ndarray,
     weight: np.ndarray,
     there: np.ndarray,
-    cameras: Sequence[Camera],
-    pictures: Mapping[str, list[np.ndarray | None]],
+    levels: Sequence[Sequence[_Shot]],
     cfg: AlignConfig,
 ) -> Motion:
     """One part: `start` (n, V, 3), the `chosen` of V, their visibility (C, n, P), frames with the part (n,)."""
-    count = len(start)
-    motion = Motion(np.zeros((count, 3)), np.zeros((count, 3)), np.nan, np.nan)
+    rest = motion = Motion(np.zeros((len(start), 3)), np.zeros((len(start), 3)), np.nan, np.nan)
     if there.sum() < 2 or not weight.any():
-        return motion
+        return rest
     centre, points = start.mean(1), start[:, chosen]
     alike = _likeness(points, 1e-3 * cfg.likeness_mm) * (there[:, None] & there)
     prior = np.repeat([np.radians(cfg.turn_deg) ** -2.0, (1e-3 * cfg.shift_mm) ** -2.0], 3)
-    before = after = np.nan
-    for level in _LEVELS:
-        shots = [_shot(camera, pictures[camera.name], level, cfg.lines) for camera in cameras]
-        before = _System.of(
-            points, centre, Motion(motion.turn * 0, motion.shift * 0, 0, 0), shots, weight, alike
-        ).typical
+    for shots in levels:
         for _ in range(cfg.iterations):
             system = _System.of(points, centre, motion, shots, weight, alike)
             so_far = np.concatenate([motion.turn, motion.shift], axis=1)
             step = -np.linalg.solve(system.matrix + np.diag(prior), (system.vector + prior * so_far)[..., None])[..., 0]
             step[~there] = 0.0
             step[there] -= step[there].mean(0)
-            motion = Motion(_composed(step[:, :3], motion.turn), motion.shift + step[:, 3:], 0, 0)
+            motion = Motion(_composed(step[:, :3], motion.turn), motion.shift + step[:, 3:], np.nan, np.nan)
             if np.abs(step[:, 3:]).mean() < _STILL:
                 break
-        after = _System.of(points, centre, motion, shots, weight, alike).typical
-    if not after < before:
-        motion = Motion(np.zeros((count, 3)), np.zeros((count, 3)), 0, 0)
-        after = before
-    return motion._replace(before=float(before), after=float(after))
+    before, after = (_System.of(points, centre, m, levels[-1], weight, alike).typical for m in (rest, motion))
+    return motion._replace(before=before, after=after) if after < before else rest._replace(before=before, after=before)
 
 
 def _composed(second: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -250,18 +241,30 @@ def _projected(points: np.ndarray, shot: _Shot) -> tuple[np.ndarray, np.ndarray]
     return pixels, shot.scale * slope @ camera.cam_from_world[:3, :3]
 
 
-def _shot(camera: Camera, pictures: Sequence[np.ndarray | None], level: float, lines: int) -> _Shot:
-    """Details of one camera's pictures, at a height of at most `lines`; nothing where a picture is missing."""
+def _working_size(camera: Camera, cfg: AlignConfig) -> tuple[int, int]:
+    """Width and height [px] of the pictures that are worked on."""
+    scale = min(1.0, cfg.lines / camera.height)
+    return max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+
+
+def _reduced(picture: np.ndarray | None, camera: Camera, cfg: AlignConfig) -> np.ndarray | None:
+    """A picture at the size that is worked on."""
     import cv2
 
-    scale = min(1.0, lines / camera.height)
-    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    details = np.zeros((len(pictures), size[1], size[0], 3), np.float16)  # details are small: 11 bits are plenty
+    return None if picture is None else cv2.resize(picture, _working_size(camera, cfg), interpolation=cv2.INTER_AREA)
+
+
+def _shot(camera: Camera, pictures: Sequence[np.ndarray | None], level: float, cfg: AlignConfig) -> _Shot:
+    """Details of one camera's reduced pictures; nothing where a picture is missing."""
+    import cv2
+
+    width, height = _working_size(camera, cfg)
+    details = np.zeros((len(pictures), height, width, 3), np.float16)  # details are small: 11 bits are plenty
     for row, picture in enumerate(pictures):
         if picture is not None:
-            small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+            small = picture.astype(np.float32) / 255.0
             details[row] = cv2.GaussianBlur(small, (0, 0), level) - cv2.GaussianBlur(small, (0, 0), _BAND * level)
-    return _Shot(camera, details, size[1] / camera.height)
+    return _Shot(camera, details, height / camera.height)
 
 
 def _sample(details: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -291,8 +294,7 @@ def _visible(
     count = len(next(iter(verts.values())))
     seen = {part: np.zeros((len(cameras), count, points.shape[1]), bool) for part, points in verts.items()}
     for index, camera in enumerate(cameras):
-        scale = min(1.0, cfg.lines / camera.height)
-        width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+        width, height = _working_size(camera, cfg)
         K = scale_intrinsics(camera.K, width / camera.width, height / camera.height)
         for row in range(count):
             there = [part for part in verts if np.isfinite(verts[part][row]).all()]

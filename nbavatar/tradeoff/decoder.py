@@ -4,28 +4,21 @@ import copy
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from nbavatar.avatar.unet import UNet
+from nbavatar.avatar.unet import UNet, normalised_picture
 
 __all__ = ["prepared_unet"]
 
 
 class _PictureNorm(nn.Module):
-    """Instance normalisation of one picture as a batch normalisation, the same sums over the same pixels.
-
-    torch's own copies a channels-last tensor to channels first and back, which on a CPU takes longer than the
-    convolutions beside it; its batch normalisation works in either layout.
-    """
+    """A U-Net's normalisation of one picture by `normalised_picture`, in rendering too."""
 
     def __init__(self, norm: nn.InstanceNorm2d) -> None:
         super().__init__()
-        self.weight, self.bias, self.eps = norm.weight, norm.bias, norm.eps
+        self._norm = norm
 
     def forward(self, pixels: Tensor) -> Tensor:
-        if pixels.shape[-1] * pixels.shape[-2] == 1:  # a single pixel has no variance
-            return pixels
-        return functional.batch_norm(pixels, None, None, self.weight, self.bias, training=True, eps=self.eps)
+        return normalised_picture(self._norm, pixels)
 
 
 def prepared_unet(unet: UNet | None, *, channels_last: bool, batch_norm: bool) -> UNet | None:
