@@ -20,7 +20,7 @@ from nbavatar.raster.projection import Projection
 __all__ = ["RECORD", "TILE_HEIGHT", "TILE_WIDTH", "Bins", "bin_billboards", "require_memory"]
 
 TILE_WIDTH = 32  # pixels
-TILE_HEIGHT = 16
+TILE_HEIGHT = 32
 RECORD = 16  # numbers in a billboard's record; see `pack`
 _SLACK = 1e-3  # pixels by which bounds are widened, far more than rounding can move a corner
 

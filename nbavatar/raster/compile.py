@@ -34,8 +34,8 @@ _LOG = logging.getLogger("nbavatar.raster")
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 _SOURCES = (
-    "binning.py", "compile.py", "cpu_blend.py", "cpu_gather.py", "cpu_hits.py", "cpu_pixels.py", "cpu_projection.py",
-    "cpu_queue.py", "lanes.py", "memory.py", "scalar.py",
+    "binning.py", "compile.py", "cpu_blend.py", "cpu_gather.py", "cpu_groups.py", "cpu_hits.py", "cpu_pixels.py",
+    "cpu_projection.py", "cpu_queue.py", "lanes.py", "memory.py", "scalar.py",
 )  # fmt: skip
 
 

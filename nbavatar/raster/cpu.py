@@ -107,8 +107,9 @@ class _Scene:
         s = self.settings
         pixels = s.width * s.height
         require_memory(pixels * (self.channels + 1) * self.limits.itemsize, f"an image of {s.width}x{s.height} pixels")
-        image = torch.empty(self.channels, s.height, s.width, dtype=self.dtype)
-        opacity = torch.empty(s.height, s.width, dtype=self.dtype)
+        real = self.limits.dtype
+        image = torch.from_numpy(workspace.empty((self.channels, s.height, s.width), real))
+        opacity = torch.from_numpy(workspace.empty((s.height, s.width), real))
         nothing = np.zeros(0, self.limits.dtype)
         results = (image.view(-1).numpy(), opacity.view(-1).numpy())
         whole = np.zeros(0, np.int32)
@@ -151,7 +152,7 @@ class _Scene:
         """An image (C, H, W) as (H, W, stride), flat."""
         pixels = self.settings.width * self.settings.height
         planes = image.to(self.dtype).contiguous().view(-1).numpy()
-        rows = workspace.empty((pixels * self.stride,), self.limits.dtype)
+        rows = workspace.empty(((pixels + LANES) * self.stride,), self.limits.dtype)
         turn = np.zeros(1, np.int64)
         run_workers(lambda _: cpu_gather.interleave(turn, 1 << 14, planes, rows, self.channels, pixels))
         return rows
@@ -203,8 +204,8 @@ class _Scene:
             rows //= 2
 
     def _bytes(self, rows: int, capacity: int, groups: int) -> int:
-        reals, wholes, wides = cpu_pixels.scratch_sizes(rows, capacity, self.channels, groups, True)
-        return reals * self.limits.itemsize + wholes * 4 + wides * 8
+        reals, wholes = cpu_pixels.scratch_sizes(rows, capacity, self.channels, groups, True)
+        return reals * self.limits.itemsize + wholes * 4
 
     def _run(
         self, plan: _Pass, replay: bool, image: np.ndarray, opacity: np.ndarray, grads: np.ndarray, covers: np.ndarray,
@@ -216,19 +217,19 @@ class _Scene:
         require_memory(
             workers * self._bytes(plan.rows, plan.capacity, plan.groups), f"queues of {plan.capacity} hits a pixel"
         )
-        reals, wholes, wides = cpu_pixels.scratch_sizes(plan.rows, plan.capacity, self.channels, plan.groups, replay)
+        reals, wholes = cpu_pixels.scratch_sizes(plan.rows, plan.capacity, self.channels, plan.groups, replay)
         values = [self.texels, self.channels, s.width, s.height, self.across, s.queue, plan.capacity, plan.rows,
-                  plan.groups, int(replay), int(s.queue < 0 and plan.capacity > _QUEUE)]  # fmt: skip
+                  plan.groups, int(s.queue < 0 and plan.capacity > _QUEUE)]  # fmt: skip
         shape = np.array(values, np.int64)
         turn = np.zeros(1, np.int64)
 
         def work(_: int) -> np.ndarray:
             status = np.zeros(3 + len(plan.tiles), np.int64)
-            cpu_blend.blend_tiles(
+            (cpu_blend.note_tiles if replay else cpu_blend.blend_tiles)(
                 turn, plan.tiles, b.start, b.members, b.record.reshape(-1), b.box, b.place, self.features,
                 self.alpha, self.limits, shape, image, opacity, grads, covers, notes, spots, ranges,
-                self.made if made is None else made, base, torch.empty(reals, dtype=self.dtype).numpy(),
-                torch.empty(wholes, dtype=torch.int32).numpy(), torch.empty(wides, dtype=torch.int64).numpy(), status,
+                self.made if made is None else made, base, workspace.empty((reals,), self.limits.dtype),
+                workspace.empty((wholes,), np.dtype(np.int32)), status,
             )  # fmt: skip
             return status
 
@@ -276,7 +277,12 @@ def _prepare(dtype: torch.dtype) -> None:
             cpu_blend.blend_tiles: (
                 array(i64), array(i32), array(i64), array(i32), array(real), array(i32, 2), array(i32), array(real),
                 array(real), array(real), array(i64), *[array(real)] * 5, *[array(i32)] * 2, array(i64), i64,
-                array(real), array(i32), array(i64), array(i64),
+                array(real), array(i32), array(i64),
+            ),
+            cpu_blend.note_tiles: (
+                array(i64), array(i32), array(i64), array(i32), array(real), array(i32, 2), array(i32), array(real),
+                array(real), array(real), array(i64), *[array(real)] * 5, *[array(i32)] * 2, array(i64), i64,
+                array(real), array(i32), array(i64),
             ),
             cpu_gather.interleave: (array(i64), i64, array(real), array(real), i64, i64),
             cpu_gather.gather_gradients: (

@@ -6,252 +6,215 @@ billboards still to come can reach are final and are blended. A pixel that has b
 be once its waiting hits are blended, takes no more hits from behind them. With a queue of n hits, or
 none, the same loop gives `kbuffer(n)` and `center`.
 
-Everything but the texels of a hit is done for eight pixels at a time.
+Everything is done for eight pixels at a time, the texels of a hit in rows of eight channels.
 """
 
 import numpy as np
 
 from nbavatar.raster.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
 from nbavatar.raster.compile import kernel
-from nbavatar.raster.cpu_hits import (
-    INFINITE,
-    LOWEST,
-    NONE,
-    ONE,
-    SIZE,
-    ZERO,
-    affine,
-    cells,
-    corners,
-    footprint,
-    intersect,
-    mix,
-    patch_of,
-    read_limits,
-    spans,
-)  # fmt: skip
-from nbavatar.raster.cpu_pixels import Scene, blend, close, divide, settle, write
+from nbavatar.raster.cpu_groups import COLUMN, ROW, list_groups, locate, sample
+from nbavatar.raster.cpu_hits import INFINITE, LOWEST, NONE, ONE, SIZE, ZERO, patch_of, read_limits, spans
+from nbavatar.raster.cpu_pixels import Scene, blend, close, divide, evaluate, keep_worth, settle, write
 from nbavatar.raster.cpu_queue import append, arrange, count_waiting, drain, enqueue, pop
-from nbavatar.raster.lanes import (
-    LANES,
-    any_lane,
-    bits,
-    choose,
-    count_bits,
-    first_lanes,
-    is_nan,
-    lane_numbers,
-    load,
-    minimum,
-    ramp,
-    spread,
-    store,
-    to_wide,
-)  # fmt: skip
-from nbavatar.raster.memory import fetch_add, get, pointer, prefetch, put
+from nbavatar.raster.lanes import LANES, any_lane, bits, choose, lane_numbers, load, spread, store
+from nbavatar.raster.memory import ahead, fetch_add, get, pointer, prefetch, put
 
-__all__ = ["blend_tiles"]
+__all__ = ["blend_tiles", "note_tiles"]
 
-_PATIENCE = 1024  # hits that wait in a tile's queues before it is looked which of them are final
+_PATIENCE = 2048  # hits that wait in a tile's queues before it is looked which of them are final
 _CROWD = 64  # hits that wait at one pixel of unsorted queues before the same
 _AHEAD = 512  # texels of the next billboard's opacity that are asked for in advance
 
 
-@kernel
-def blend_tiles(turn, tiles, start, members_, record_, box, place_, features_, alpha_, limits_, shape, image_, opacity_,
-                grads_, grad_opacity_, notes_, spots_, ranges_, made, base, real, whole, wide, status):  # fmt: skip
-    """Works through tiles until none is left: blends them, or notes what `collect` needs.
+def _build(replay):
+    """The kernel that blends, or the one that repeats the blending and notes its gradients' parts.
 
-    Args:
-        turn: (1,) int64, next position in `tiles`, shared by all workers.
-        tiles: (n,) int32, in the order in which to take them.
-        start, members, record, box, place: see Bins; `record` flat.
-        features, alpha: textures, flat.
-        limits: see `cpu_hits`.
-        shape: texels, channels, width, height, tiles across, queue, capacity of a queue, rows worked on at
-            once, groups that there is room for, replay, whether hits wait unsorted.
-        image, opacity: (C, H, W), (H, W) results, flat; not written in the replay.
-        grads: (H, W, stride) flat, gradients of the image, filled up with zeros; grad_opacity: (H, W) flat. These
-            and what follows are used in the replay.
-        notes: per group of hits, T a and then the gradient by a of the LANES hits; 0 where there is none.
-        spots: per group, x of the first pixel and y.
-        ranges: per band and tile entry, first and end of its groups, from those of the tile on.
-        made: (tiles + 1,) int64; groups made in each tile, written by the forward pass; in the replay their
-            running number, the tile's first.
-        base: number of the first of the groups in `notes`.
-        real, whole, wide: scratch of this worker; see `scratch_sizes`.
-        status: [number of tiles given up, billboard with a NaN alpha + 1, hits, tiles given up ...].
+    Two kernels from one source: neither holds the other's code, which would take registers from its own.
     """
-    texels, channels, width, height, across, queue, capacity, rows, room = (
-        shape[0], shape[1], shape[2], shape[3], shape[4], shape[5], shape[6], shape[7], shape[8],
-    )  # fmt: skip
-    replay, unsorted = shape[9] != 0, shape[10] != 0
-    members, record, place = pointer(members_, 0), pointer(record_, 0), pointer(place_, 0)
-    alpha, limits = pointer(alpha_, 0), pointer(limits_, 0)
-    image, opacity = pointer(image_, 0), pointer(opacity_, 0)
-    notes, spots, ranges = pointer(notes_, 0), pointer(spots_, 0), pointer(ranges_, 0)
-    common = read_limits(limits)
-    zero, one, none = get(limits, ZERO), get(limits, ONE), get(limits, NONE)
-    stride = (channels + LANES - 1) // LANES * LANES
-    plane = TILE_WIDTH * rows + LANES
-    k = divide(real, whole, wide, plane, stride, capacity, room)
-    step = min(1, texels - 1)
-    right, below = step * channels, step * texels * channels
-    scene = Scene(
-        pointer(features_, 0), common, right, below, right + below, channels, stride, plane, room * LANES, replay,
-        pointer(grads_, 0), pointer(grad_opacity_, 0), notes, pointer(status, 0),
-    )  # fmt: skip
-    for i in range(capacity * plane):
-        put(k.keys, i, none)
-        put(k.ids, i, 0)
-    while True:
-        position = fetch_add(turn, 1)
-        if position >= len(tiles):
-            break
-        tile = tiles[position]
-        left, tile_top = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
-        right, tile_bottom = min(left + TILE_WIDTH, width), min(tile_top + TILE_HEIGHT, height)
-        first_entry, end_entry = start[tile], start[tile + 1]
-        noted = made[tile] - base if replay else 0
-        total_groups, hits_before = 0, status[2]
-        overflow = False
-        for top in range(tile_top, tile_bottom, rows):
-            bottom = min(top + rows, tile_bottom)
-            pixels = TILE_WIDTH * (bottom - top)
-            for i in range(plane):  # pixels off the image count as finished
-                put(k.through, i, zero)
-                put(k.floor, i, get(limits, INFINITE))
-            for y in range(bottom - top):
-                for x in range(right - left):
-                    put(k.through, y * TILE_WIDTH + x, one)
-                    put(k.floor, y * TILE_WIDTH + x, none)
-            if replay:
-                for i in range(plane):
-                    put(k.last, i, -1)
-            else:
-                for i in range(pixels * stride):
-                    put(k.sums, i, zero)
-            if unsorted:
-                for i in range(plane):
-                    put(k.count, i, 0)
-            crowded = _CROWD if unsorted else capacity
-            active = (bottom - top) * (right - left)
-            level, groups, waiting = 0, 0, 0
-            for entry in range(first_entry, end_entry + 1):
-                final = entry == end_entry
-                i = 0
-                reach = get(limits, LOWEST)
-                if not final:
-                    i = get(members, entry)
-                    reach = get(record, i * RECORD + 11)
-                patient = unsorted or waiting < _PATIENCE
-                if level > 0 and (final or (queue < 0 and (level >= crowded or not patient))):
-                    if unsorted:
-                        arrange(scene, k, pixels)
-                    level, finished = drain(scene, k, reach, level, left, top, pixels, width, noted)
-                    active -= finished
-                    waiting = 0
-                    if unsorted:  # next when the longest queue has doubled: the sorting stays in proportion
-                        count_waiting(scene, k, pixels, level, none)
-                        crowded = max(_CROWD, 2 * level)
-                    else:
-                        overflow = level == capacity and not final
-                if final or overflow or active == 0:
-                    break
-                first_group = groups
-                x_first, x_end = max(left, box[i, 0]), min(right, box[i, 2])
-                y_first, y_end = max(top, box[i, 1]), min(bottom, box[i, 3])
-                if y_first >= y_end:
-                    continue
-                r = i * RECORD
-                if entry + 1 < end_entry:  # the next billboard's opacities come while this one is worked on
-                    for j in range(0, min(texels * texels, _AHEAD), 64 // alpha_.itemsize):
-                        prefetch(alpha, np.int64(get(members, entry + 1)) * texels * texels + j)
-                x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
-                patch = patch_of(record, r)
-                texture = np.int64(i) * texels * texels
-                coming = 0
-                if queue == 0:  # no time until the hit is blended: the texels of the next rows
-                    coming = (texels if get(record, r + 4) > zero else -texels) * channels * step
-                spans(record, r, get(limits, SIZE), one, x_first, x_end, x_origin, y_first, y_end, y_origin, k.ends)
-                for y in range(y_first, y_end):
-                    row_end = np.int64(get(k.ends, TILE_HEIGHT + y - y_first))
-                    for x in range(get(k.ends, y - y_first), row_end, LANES):
-                        first = (y - top) * TILE_WIDTH + x - left
-                        floor = load(k.floor, first)
-                        hit = first_lanes(row_end - x) & (floor <= spread(reach))
-                        if not any_lane(hit):
-                            continue
-                        dx = spread(zero + np.float32(x - x_origin)) + ramp(zero)
-                        dy = spread(zero + np.float32(y - y_origin))
-                        s, t, _, valid = intersect(patch, dx, dy, common)
-                        foot = footprint(s, t, common)
-                        cell = cells(foot, texels)
-                        t00, t01, t10, t11 = corners(pointer(alpha_, texture), cell, step, step * texels)
-                        sample = mix(t00, t01, t10, t11, foot.x0, foot.x1, foot.y0, foot.y1)
-                        key = affine(patch.w_x, patch.w_y, patch.key, dx, dy)
-                        hit = hit & valid
-                        if any_lane(hit & is_nan(sample)):
-                            status[1] = i + 1
-                        hit = hit & (sample >= common.alpha_min) & (key >= floor)
-                        word = bits(hit)
-                        if word == 0:
-                            continue
-                        texel = to_wide(cell * spread(np.int32(channels))) + spread(texture * channels)
-                        store(k.texel, groups * LANES, texel)
-                        opaque = minimum(patch.fade * sample, common.alpha_max)
-                        store(k.opacity, groups * LANES, opaque)
-                        at, hits = groups * LANES, room * LANES
-                        store(k.weights, at, foot.y0 * foot.x0)
-                        store(k.weights, at + hits, foot.y0 * foot.x1)
-                        store(k.weights, at + 2 * hits, foot.y1 * foot.x0)
-                        store(k.weights, at + 3 * hits, foot.y1 * foot.x1)
-                        put(k.place, groups, get(place, i))
+
+    @kernel
+    def work(turn, tiles, start, members_, record_, box, rank_, features_, alpha_, limits_, shape, image_, opacity_,
+             grads_, grad_opacity_, notes_, spots_, ranges_, made, base, real, whole, status):  # fmt: skip
+        """Works through tiles until none is left: blends them, or notes what `gather_gradients` needs.
+
+        Args:
+            turn: (1,) int64, next position in `tiles`, shared by all workers.
+            tiles: (n,) int32, in the order in which to take them.
+            start, members, record, box, rank: see Bins (`place` is the rank); `record` flat.
+            features, alpha: textures, flat.
+            limits: see `cpu_hits`.
+            shape: texels, channels, width, height, tiles across, queue, capacity of a queue, rows worked on at
+                once, groups that there is room for, whether hits wait unsorted.
+            image, opacity: (C, H, W), (H, W) results, flat; not written in the replay.
+            grads: (H, W, stride) flat, gradients of the image, filled up with zeros; grad_opacity: (H, W) flat. These
+                and what follows are used in the replay.
+            notes: per group of hits, T a and then the gradient by a of the LANES hits; 0 where there is none.
+            spots: per group, x of the first pixel and y.
+            ranges: per band and tile entry, first and end of its groups, from those of the tile on.
+            made: (tiles + 1,) int64; groups made in each tile, written by the forward pass; in the replay their
+                running number, the tile's first.
+            base: number of the first of the groups in `notes`.
+            real, whole: scratch of this worker; see `scratch_sizes`.
+            status: [number of tiles given up, billboard with a NaN alpha + 1, hits, tiles given up ...].
+        """
+        texels, channels, width, height, across, queue, capacity, rows, room = (
+            shape[0], shape[1], shape[2], shape[3], shape[4], shape[5], shape[6], shape[7], shape[8],
+        )  # fmt: skip
+        unsorted = shape[9] != 0
+        members, record, rank = pointer(members_, 0), pointer(record_, 0), pointer(rank_, 0)
+        alpha, limits = pointer(alpha_, 0), pointer(limits_, 0)
+        image, opacity = pointer(image_, 0), pointer(opacity_, 0)
+        notes, spots, ranges = pointer(notes_, 0), pointer(spots_, 0), pointer(ranges_, 0)
+        zero, one, none = get(limits, ZERO), get(limits, ONE), get(limits, NONE)
+        stride = (channels + LANES - 1) // LANES * LANES
+        plane = TILE_WIDTH * rows + LANES
+        k = divide(real, whole, plane, stride, capacity, room, replay)
+        step = min(1, texels - 1)
+        scene = Scene(
+            pointer(features_, 0), read_limits(limits), zero, step * channels, step * texels * channels,
+            step * (texels + 1) * channels, channels, stride, plane, room * LANES,
+            pointer(grads_, 0), pointer(grad_opacity_, 0), notes, pointer(status, 0),
+        )  # fmt: skip
+        for i in range(capacity * plane):
+            put(k.keys, i, none)
+            put(k.ids, i, 0)
+        if not replay:
+            for i in range(stride):
+                put(k.features, room * LANES * stride + i, zero)
+        while True:
+            position = fetch_add(turn, 1)
+            if position >= len(tiles):
+                break
+            tile = tiles[position]
+            left, tile_top = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
+            right, tile_bottom = min(left + TILE_WIDTH, width), min(tile_top + TILE_HEIGHT, height)
+            first_entry, end_entry = start[tile], start[tile + 1]
+            noted = made[tile] - base if replay else 0
+            total_groups, hits_before = 0, status[2]
+            overflow = False
+            for top in range(tile_top, tile_bottom, rows):
+                bottom = min(top + rows, tile_bottom)
+                pixels = TILE_WIDTH * (bottom - top)
+                for i in range(plane):  # pixels off the image count as finished
+                    put(k.through, i, zero)
+                    put(k.floor, i, get(limits, INFINITE))
+                for y in range(bottom - top):
+                    for x in range(right - left):
+                        put(k.through, y * TILE_WIDTH + x, one)
+                        put(k.floor, y * TILE_WIDTH + x, none)
+                if replay:
+                    for i in range(plane):
+                        put(k.last, i, -1)
+                else:
+                    for i in range(pixels * stride):
+                        put(k.sums, i, zero)
+                if unsorted:
+                    for i in range(plane):
+                        put(k.count, i, 0)
+                crowded = _CROWD if unsorted else capacity
+                active = (bottom - top) * (right - left)
+                level, groups, waiting = 0, 0, 0
+                for entry in range(first_entry, end_entry + 1):
+                    final = entry == end_entry
+                    i = 0
+                    reach = get(limits, LOWEST)
+                    if not final:
+                        i = get(members, entry)
+                        reach = get(record, i * RECORD + 11)
+                    patient = unsorted or waiting < _PATIENCE
+                    if level > 0 and (final or (queue < 0 and (level >= crowded or not patient))):
+                        if unsorted:
+                            arrange(scene, k, pixels)
+                        level, finished = drain(scene, k, replay, reach, level, pixels, noted)
+                        active -= finished
+                        waiting = 0
+                        if unsorted:  # next when the longest queue has doubled: the sorting stays in proportion
+                            count_waiting(scene, k, pixels, level, none)
+                            crowded = max(_CROWD, 2 * level)
+                        else:
+                            overflow = level == capacity and not final
+                    if final or overflow or active == 0:
+                        break
+                    first_group = groups
+                    x_first, x_end = max(left, box[i, 0]), min(right, box[i, 2])
+                    y_first, y_end = max(top, box[i, 1]), min(bottom, box[i, 3])
+                    if y_first >= y_end:
+                        continue
+                    r = i * RECORD
+                    if entry + 1 < end_entry:  # the next billboard's opacities come while this one is worked on
+                        for j in range(0, min(texels * texels, _AHEAD), 64 // alpha_.itemsize):
+                            prefetch(alpha, np.int64(get(members, entry + 1)) * texels * texels + j)
+                    x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
+                    patch = patch_of(record, r)
+                    texture = np.int64(i) * texels * texels
+                    spans(record, r, get(limits, SIZE), one, x_first, x_end, x_origin, y_first, y_end, y_origin, k.ends)
+                    count = list_groups(k, left, top, y_first, y_end, spread(reach))
+                    locate(scene, k, patch, count, texture, x_origin - left, y_origin - top, spread(reach), texels)
+                    found, hits, broken = sample(
+                        scene, k, ahead(alpha, texture), patch.fade, count, groups, get(rank, i), step, step * texels
+                    )
+                    if broken:
+                        status[1] = i + 1
+                    waiting += hits
+                    for m in range(found):
+                        j, group = np.int64(get(k.order, m)), groups + m
                         if replay:
-                            at = 2 * LANES * (noted + groups)
-                            store(notes, at, common.zero)
-                            store(notes, at + LANES, common.zero)
-                            put(spots, 2 * (noted + groups), x)
-                            put(spots, 2 * (noted + groups) + 1, y)
-                        ids = spread(np.int32(groups * LANES)) + lane_numbers()
-                        groups += 1
-                        waiting += count_bits(word)
-                        for lane in (0, LANES // 2, LANES - 1):  # and its features, before it is their turn
-                            at = get(k.texel, groups * LANES - LANES + lane) + coming
-                            prefetch(scene.features, at)
-                            prefetch(scene.features, at + below)
+                            first = np.int64(get(k.first, j))
+                            x, y = left + (first & COLUMN), top + (first >> ROW)
+                            evaluate(scene, k, ahead(scene.features, texture * channels), j, k.features)
+                            keep_worth(scene, k, j, group, y * width + x)
+                            at = noted + group
+                            store(notes, 2 * LANES * at, scene.limits.zero)
+                            store(notes, 2 * LANES * at + LANES, scene.limits.zero)
+                            put(spots, 2 * at, x)
+                            put(spots, 2 * at + 1, y)
+                        else:
+                            own = ahead(k.features, group * LANES * stride)
+                            evaluate(scene, k, ahead(scene.features, texture * channels), j, own)
+                    for m in range(found):
+                        j, group = np.int64(get(k.order, m)), groups + m
+                        first, key = np.int64(get(k.first, j)), load(k.key, j * LANES)
+                        hit = key > scene.limits.none
+                        ids = spread(np.int32(group * LANES)) + lane_numbers()
                         if queue == 0:
-                            through = load(k.through, first)
-                            blend(scene, k, word, first, y * width + x, through, through * opaque, ids, noted)
-                            through = choose(hit, through * (common.one - opaque), through)
+                            through, opaque = load(k.through, first), load(k.opacity, group * LANES)
+                            blend(scene, k, replay, hit, first, through, through * opaque, ids, noted)
+                            through = choose(hit, through * (scene.limits.one - opaque), through)
                             store(k.through, first, through)
                             _, finished = close(scene, k, first, through)
                             active -= finished
                         elif unsorted:
-                            level = append(scene, k, word, key, ids, first, level)
+                            level = append(scene, k, bits(hit), key, ids, first, level)
                         else:
-                            level = enqueue(scene, k, hit, key, opaque, ids, first, level)
+                            level = enqueue(scene, k, key, ids, first, level)
                             if queue > 0 and level > queue:
-                                full = load(k.keys, queue * plane + first) > common.none
+                                full = load(k.keys, queue * plane + first) > scene.limits.none
                                 if any_lane(full):
-                                    active -= pop(scene, k, first, y * width + x, full, level, noted)
+                                    active -= pop(scene, k, replay, first, full, level, noted)
+                    groups += found
+                    if replay:
+                        at = 2 * ((top - tile_top) // rows * len(members_) + entry)
+                        put(ranges, at, first_group + total_groups)
+                        put(ranges, at + 1, groups + total_groups)
+                if overflow:
+                    for i in range(capacity * plane):
+                        put(k.keys, i, none)
+                    break
+                noted += groups
+                total_groups += groups
                 if replay:
-                    at = 2 * ((top - tile_top) // rows * len(members_) + entry)
-                    put(ranges, at, first_group + total_groups)
-                    put(ranges, at + 1, groups + total_groups)
+                    settle(scene, k, left, right, top, bottom, noted - groups, zero, one)
+                else:
+                    write(scene, k, image, opacity, left, right, top, bottom, width, height)
             if overflow:
-                for i in range(capacity * plane):
-                    put(k.keys, i, none)
-                break
-            noted += groups
-            total_groups += groups
-            if replay:
-                settle(scene, k, left, right, top, bottom, noted - groups, zero, one)
-            else:
-                write(scene, k, image, opacity, left, right, top, bottom, width, height)
-        if overflow:
-            status[3 + status[0]] = tile
-            status[0] += 1
-            status[2] = hits_before
-        elif not replay:
-            made[tile] = total_groups
+                status[3 + status[0]] = tile
+                status[0] += 1
+                status[2] = hits_before
+            elif not replay:
+                made[tile] = total_groups
+
+    return work
+
+
+blend_tiles, note_tiles = _build(False), _build(True)

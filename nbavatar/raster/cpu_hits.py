@@ -24,7 +24,7 @@ from nbavatar.raster.lanes import (
     store,
     to_int,
 )  # fmt: skip
-from nbavatar.raster.memory import get
+from nbavatar.raster.memory import ahead, get
 
 __all__ = [
     "INFINITE", "LOWEST", "NONE", "ONE", "SIZE", "ZERO", "Footprint", "Limits", "Patch", "affine", "cells", "corners",
@@ -181,10 +181,9 @@ def cells(foot, texels):
 @inlined
 def corners(texture, cell, right, below):
     """Four texels around hits; `right` and `below` are how far the neighbours are."""
-    under = spread(np.int32(below))
     if right == 0:  # a single texel
         texel = gather(texture, cell)
         return texel, texel, texel, texel
     above, beside = gather_pairs(texture, cell)
-    lower, last = gather_pairs(texture, cell + under)
+    lower, last = gather_pairs(ahead(texture, below), cell)
     return above, beside, lower, last

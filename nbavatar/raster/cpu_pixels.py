@@ -18,44 +18,94 @@ from nbavatar.raster.lanes import (
     spread,
     store,
     store_where,
-    total,
     transpose,
 )  # fmt: skip
 from nbavatar.raster.memory import ahead, get, pointer, put
 
-__all__ = ["LANE", "SHIFT", "Scene", "Scratch", "blend", "close", "divide", "scratch_sizes", "settle", "write"]
+__all__ = [
+    "LANE", "SHIFT", "Scene", "Scratch", "blend", "close", "divide", "evaluate", "keep_worth", "scratch_sizes",
+    "settle", "write",
+]  # fmt: skip
 
 SHIFT, LANE = 3, LANES - 1  # a hit's number is LANES * group + lane
+_GROUPS = TILE_HEIGHT * (TILE_WIDTH // LANES) + LANES  # of one billboard in a tile; lists are filled LANES at a time
 
 
 class Scratch(NamedTuple):
     """Memory of one worker; see `blend_tiles`. Whole numbers are int32."""
 
-    through: Any  # transmittance of each pixel
+    # of the band's pixels
+    through: Any  # transmittance
     floor: Any  # hits with a smaller key than this are of no use to the pixel
     sums: Any  # blended features, `stride` a pixel
-    keys: Any  # queues: keys, `plane` a slot; an empty place holds -infinity
-    dims: Any  # queues: opacities
-    ids: Any  # queues: numbers of the hits
-    weights: Any  # of each hit's first texel; those of the next three follow `room` numbers on each
-    opacity: Any  # of each hit
-    place: Any  # rank of each group's billboard
-    row: Any  # room for two rows of numbers
-    whole: Any  # and for one of whole numbers
-    ends: Any  # columns of a billboard's rows
-    count: Any  # slots in use at each pixel, where hits are put behind the queues unsorted
-    texel: Any  # int64: first channel of each hit's first texel
-    before: Any  # replay: the hit blended before each hit at its pixel, or -1
-    last: Any  # replay: the hit blended last at each pixel
+    count: Any  # slots in use, where hits are put behind the queues unsorted
+    last: Any  # replay: the hit blended last
+    # queues of hits, `plane` a slot
+    keys: Any  # an empty place holds -infinity
+    ids: Any  # numbers of the hits
+    # of the band's hits
+    opacity: Any
+    features: Any  # `stride` a hit, and a row of zeros behind them; replay: of one group
+    worth: Any  # replay: what a hit's share of its pixel changes
+    before: Any  # replay: the hit blended before it at its pixel, or -1
+    rank: Any  # of each group's billboard
+    # of the billboard in hand, group by group
+    key: Any  # of its hits; -infinity where there is none
+    weights: Any  # of their four texels
+    cell: Any  # number of their first texel in the texture
+    first: Any  # place of the first pixel in the band
+    rest: Any  # pixels from there to the end of the billboard's row
+    order: Any  # those with a hit
+    ends: Any  # columns of the billboard's rows
+    # room for a row of numbers
+    row: Any
+    whole: Any
 
 
-def scratch_sizes(rows: int, capacity: int, channels: int, groups: int, replay: bool) -> tuple[int, int, int]:
-    """Numbers, int32 and int64 that a worker needs for bands of `rows` rows with `groups` groups of hits."""
+def scratch_sizes(rows: int, capacity: int, channels: int, groups: int, replay: bool) -> tuple[int, int]:
+    """Numbers and int32 that a worker needs for bands of `rows` rows with `groups` groups of hits; see `divide`."""
     plane = TILE_WIDTH * rows + LANES
     stride = -(-channels // LANES) * LANES
-    reals = 2 * plane + plane * stride + 2 * capacity * plane + 2 * LANES + groups * 5 * LANES
-    wholes = capacity * plane + groups + LANES + 2 * TILE_HEIGHT + plane
-    return reals, wholes + (groups * LANES + plane if replay else 0), groups * LANES
+    hits = groups * LANES
+    features = LANES * stride + hits if replay else (hits + 1) * stride
+    reals = plane * (2 + stride + capacity) + hits + LANES + features + 5 * LANES * _GROUPS + LANES
+    wholes = plane * (1 + capacity) + groups + 1 + (LANES + 3) * _GROUPS + 2 * TILE_HEIGHT + LANES
+    return reals, wholes + (hits + plane if replay else 0)
+
+
+@inlined
+def divide(real, whole, plane, stride, capacity, groups, replay):
+    """Divides a worker's arrays as `scratch_sizes` counts.
+
+    Opacities and ranks have room for a group more, which is written before it is known whether it has a hit.
+    """
+    hits = groups * LANES
+    floor, sums, keys = plane, 2 * plane, (2 + stride) * plane
+    opacity = keys + capacity * plane
+    key = opacity + hits + LANES
+    weights = key + LANES * _GROUPS
+    row = weights + 4 * LANES * _GROUPS
+    features = row + LANES
+    worth = features + LANES * stride
+    ids = plane
+    rank = ids + capacity * plane
+    cell = rank + groups + 1
+    first = cell + LANES * _GROUPS
+    rest, order, ends = first + _GROUPS, first + 2 * _GROUPS, first + 3 * _GROUPS
+    line = ends + 2 * TILE_HEIGHT
+    last = line + LANES
+    before = last + plane
+    if not replay:  # not used, and no room
+        worth, last, before = 0, 0, 0
+    return Scratch(
+        pointer(real, 0), pointer(real, floor), pointer(real, sums), pointer(whole, 0), pointer(whole, last),
+        pointer(real, keys), pointer(whole, ids),
+        pointer(real, opacity), pointer(real, features), pointer(real, worth), pointer(whole, before),
+        pointer(whole, rank),
+        pointer(real, key), pointer(real, weights), pointer(whole, cell), pointer(whole, first), pointer(whole, rest),
+        pointer(whole, order), pointer(whole, ends),
+        pointer(real, row), pointer(whole, line),
+    )  # fmt: skip
 
 
 class Scene(NamedTuple):
@@ -63,6 +113,7 @@ class Scene(NamedTuple):
 
     features: Any
     limits: Any  # see `cpu_hits`
+    zero: Any  # a single one
     right: Any  # from a texel's first channel to that of the one beside it
     below: Any  # under it
     last: Any  # under and beside it
@@ -70,7 +121,6 @@ class Scene(NamedTuple):
     stride: Any  # numbers kept of a pixel's features: the channels, filled up to whole vectors
     plane: Any  # pixels of a slot of the queues
     room: Any  # hits that the scratch holds
-    replay: Any
     grads: Any
     grad_opacity: Any
     notes: Any
@@ -78,72 +128,88 @@ class Scene(NamedTuple):
 
 
 @inlined
-def divide(real, whole, wide, plane, stride, capacity, groups):
-    """Divides a worker's arrays as `scratch_sizes` counts."""
-    keys = 2 * plane + plane * stride
-    row = keys + 2 * capacity * plane
-    weights = row + 2 * LANES
-    place = capacity * plane
-    rest = place + groups
-    count = rest + LANES + 2 * TILE_HEIGHT
-    before = count + plane
-    return Scratch(
-        pointer(real, 0), pointer(real, plane), pointer(real, 2 * plane), pointer(real, keys),
-        pointer(real, keys + capacity * plane), pointer(whole, 0), pointer(real, weights),
-        pointer(real, weights + groups * 4 * LANES), pointer(whole, place), pointer(real, row), pointer(whole, rest),
-        pointer(whole, rest + LANES), pointer(whole, count), pointer(wide, 0), pointer(whole, before),
-        pointer(whole, before + groups * LANES),
-    )  # fmt: skip
-
-
-@inlined
-def _sample(scene, texel, weights, c):
-    """Channels c ... c + LANES - 1 of a hit, 0 where there are none.
-
-    Args:
-        texel: pointer to its first texel; weights: pointer to that one's weight.
-    """
+def _evaluate(scene, k, texture, j, rows, stride, c):
     used = first_lanes(scene.channels - c)
-    above = load_where(texel, c, used) * spread(get(weights, 0))
-    above = above + load_where(texel, scene.right + c, used) * spread(get(weights, scene.room))
-    under = load_where(texel, scene.below + c, used) * spread(get(weights, 2 * scene.room))
-    under = under + load_where(texel, scene.last + c, used) * spread(get(weights, 3 * scene.room))
-    return above + under
+    cell, weights = ahead(k.cell, LANES * j), ahead(k.weights, 4 * LANES * j)
+    for lane in range(LANES):
+        texel = ahead(texture, np.int64(get(cell, lane)) * scene.channels + c)
+        above = load_where(texel, 0, used) * spread(get(weights, lane))
+        above = above + load_where(texel, scene.right, used) * spread(get(weights, LANES + lane))
+        under = load_where(texel, scene.below, used) * spread(get(weights, 2 * LANES + lane))
+        under = under + load_where(texel, scene.last, used) * spread(get(weights, 3 * LANES + lane))
+        store(rows, lane * stride + c, above + under)
 
 
 @inlined
-def blend(scene, k, word, first, pixel, through, share, ids, noted):
-    """Blends one hit at each of the pixels `first + lane` with a bit in `word`, or, in the replay, notes it.
+def evaluate(scene, k, texture, j, rows):
+    """Writes the features under all lanes of group j of the billboard in hand, hits or not, to `rows`.
+
+    To leave lanes out would cost more than to work on them: see `cpu_groups`.
+    """
+    if scene.stride == LANES:  # the usual case; its offsets are constants
+        _evaluate(scene, k, texture, j, rows, LANES, 0)
+    else:
+        for c in range(0, scene.stride, LANES):
+            _evaluate(scene, k, texture, j, rows, scene.stride, c)
+
+
+@inlined
+def keep_worth(scene, k, j, group, pixel):
+    """Notes what the hits of group j would change if their share of the pixels from `pixel` on grew: replay."""
+    stride = scene.stride
+    worth = load_where(scene.grad_opacity, pixel, load(k.key, LANES * j) > scene.limits.none)
+    for c in range(0, stride, LANES):
+        row, grad = ahead(k.features, c), ahead(scene.grads, pixel * stride + c)
+        columns = transpose((
+            load(row, 0) * load(grad, 0), load(row, stride) * load(grad, stride),
+            load(row, 2 * stride) * load(grad, 2 * stride), load(row, 3 * stride) * load(grad, 3 * stride),
+            load(row, 4 * stride) * load(grad, 4 * stride), load(row, 5 * stride) * load(grad, 5 * stride),
+            load(row, 6 * stride) * load(grad, 6 * stride), load(row, 7 * stride) * load(grad, 7 * stride),
+        ))  # fmt: skip
+        above = (columns[0] + columns[1]) + (columns[2] + columns[3])
+        worth = worth + (above + ((columns[4] + columns[5]) + (columns[6] + columns[7])))
+    store(k.worth, group * LANES, worth)
+
+
+@inlined
+def _add(k, first, stride, c):
+    for lane in range(LANES):
+        at = (first + lane) * stride + c
+        row = load(k.features, np.int64(get(k.whole, lane)) * stride + c)
+        store(k.sums, at, load(k.sums, at) + row * spread(get(k.row, lane)))
+
+
+@inlined
+def blend(scene, k, replay, now, first, through, share, ids, noted):
+    """Blends one hit at each of the pixels `first + lane` in the mask `now`, or, in the replay, notes it.
 
     Args:
-        first, pixel: place of lane 0 in the band and in the image.
+        first: place of lane 0 in the band.
         through: transmittance in front of the hits; `share`: it times their opacity; `ids`: their numbers.
         noted: place of the band's first group among the notes.
     """
-    store(k.whole, 0, ids)
-    store(k.row, 0, share)
-    store(k.row, LANES, through)
+    word = bits(now)
     put(scene.status, 2, get(scene.status, 2) + count_bits(word))
-    while word != 0:
-        lane = count_trailing_zeros(word)
-        word &= word - 1
-        number = np.int64(get(k.whole, lane))
-        texel, weights = ahead(scene.features, get(k.texel, number)), ahead(k.weights, number)
-        if scene.replay:
-            worth = scene.limits.zero
-            grads = ahead(scene.grads, (pixel + lane) * scene.stride)
-            for c in range(0, scene.channels, LANES):
-                worth = worth + _sample(scene, texel, weights, c) * load(grads, c)
+    if replay:
+        store(k.whole, 0, ids)
+        store(k.row, 0, through)
+        while word != 0:
+            lane = count_trailing_zeros(word)
+            word &= word - 1
+            number = np.int64(get(k.whole, lane))
             note = 2 * LANES * (noted + (number >> SHIFT)) + (number & LANE)
-            put(scene.notes, note, get(k.row, LANES + lane))
-            put(scene.notes, note + LANES, total(worth) + get(scene.grad_opacity, pixel + lane))
+            put(scene.notes, note, get(k.row, lane))
+            put(scene.notes, note + LANES, get(k.worth, number))
             put(k.before, number, get(k.last, first + lane))
             put(k.last, first + lane, number)
+    else:  # other lanes add a row of zeros
+        store(k.whole, 0, choose(now, ids, spread(np.int32(scene.room))))
+        store(k.row, 0, choose(now, share, scene.limits.zero))
+        if scene.stride == LANES:
+            _add(k, first, LANES, 0)
         else:
-            share = spread(get(k.row, lane))
-            sums = ahead(k.sums, (first + lane) * scene.stride)
-            for c in range(0, scene.channels, LANES):
-                store(sums, c, load(sums, c) + _sample(scene, texel, weights, c) * share)
+            for c in range(0, scene.stride, LANES):
+                _add(k, first, scene.stride, c)
 
 
 @inlined

@@ -7,7 +7,6 @@ hits wait at a pixel that is too slow: there they are put behind the queue and s
 
 import numpy as np
 
-from nbavatar.raster.binning import TILE_WIDTH
 from nbavatar.raster.compile import inlined
 from nbavatar.raster.cpu_pixels import SHIFT, blend, close
 from nbavatar.raster.lanes import (
@@ -29,27 +28,23 @@ __all__ = ["append", "arrange", "count_waiting", "drain", "enqueue", "pop"]
 
 
 @inlined
-def enqueue(scene, k, hit, key, opacity, ids, first, level):
+def enqueue(scene, k, key, ids, first, level):
     """Puts hits into the queues of the pixels `first + lane`; returns how many slots are in use then.
 
-    Of equal keys the one of lower place goes first.
+    Of equal keys the one of lower rank goes first.
     """
     none, shift = scene.limits.none, spread(np.int32(SHIFT))
-    key = choose(hit, key, none)
     slot = 0
     while True:
         at = slot * scene.plane + first
-        held, held_opacity, held_id = load(k.keys, at), load(k.dims, at), load(k.ids, at)
+        held, held_id = load(k.keys, at), load(k.ids, at)
         ahead = key > held
         tie = (key == held) & (key > none)
         if any_lane(tie):
-            ahead = ahead | (tie & (gather(k.place, ids >> shift) < gather(k.place, held_id >> shift)))
+            ahead = ahead | (tie & (gather(k.rank, ids >> shift) < gather(k.rank, held_id >> shift)))
         store(k.keys, at, choose(ahead, key, held))
-        store(k.dims, at, choose(ahead, opacity, held_opacity))
         store(k.ids, at, choose(ahead, ids, held_id))
-        key, opacity, ids = (
-            choose(ahead, held, key), choose(ahead, held_opacity, opacity), choose(ahead, held_id, ids),
-        )  # fmt: skip
+        key, ids = choose(ahead, held, key), choose(ahead, held_id, ids)
         slot += 1
         if not any_lane(key > none):
             return max(level, slot)
@@ -77,7 +72,7 @@ def _behind(k, key, number, other_key, other):
     """Whether a hit is blended after another one."""
     if key != other_key:
         return key < other_key
-    return get(k.place, number >> SHIFT) > get(k.place, other >> SHIFT)
+    return get(k.rank, number >> SHIFT) > get(k.rank, other >> SHIFT)
 
 
 @inlined
@@ -120,9 +115,6 @@ def arrange(scene, k, pixels):
                 put(k.keys, at, get(k.keys, pixel))
                 put(k.ids, at, get(k.ids, pixel))
             _sink(scene, k, pixel, slot, end, key, number)
-        for slot in range(count):
-            at = slot * scene.plane + pixel
-            put(k.dims, at, get(k.opacity, np.int64(get(k.ids, at))))
 
 
 @inlined
@@ -142,7 +134,6 @@ def _shift(scene, k, first, slot, source, level, moved, done):
     to, at = slot * scene.plane + first, source * scene.plane + first
     if source < level:
         key = choose(done, none, choose(moved, load(k.keys, at), load(k.keys, to)))
-        store(k.dims, to, choose(moved, load(k.dims, at), load(k.dims, to)))
         store(k.ids, to, choose(moved, load(k.ids, at), load(k.ids, to)))
     else:
         key = choose(done | moved, none, load(k.keys, to))
@@ -151,11 +142,11 @@ def _shift(scene, k, first, slot, source, level, moved, done):
 
 
 @inlined
-def pop(scene, k, first, pixel, full, level, noted):
+def pop(scene, k, replay, first, full, level, noted):
     """Blends the nearest hit of the queues in the mask `full`; returns the number of pixels that this has finished."""
     one = scene.limits.one
-    through, opacity = load(k.through, first), load(k.dims, first)
-    blend(scene, k, bits(full), first, pixel, through, through * opacity, load(k.ids, first), noted)
+    through, opacity = load(k.through, first), gather(k.opacity, load(k.ids, first))
+    blend(scene, k, replay, full, first, through, through * opacity, load(k.ids, first), noted)
     through = choose(full, through * (one - opacity), through)
     store(k.through, first, through)
     done, finished = close(scene, k, first, through)
@@ -165,7 +156,7 @@ def pop(scene, k, first, pixel, full, level, noted):
 
 
 @inlined
-def drain(scene, k, reach, level, left, top, pixels, width, noted):
+def drain(scene, k, replay, reach, level, pixels, noted):
     """Blends all hits at least as near as `reach`; returns slots in use and pixels that this has finished.
 
     A blended hit stays in its slot, with the key infinity, until the slot can go for all lanes. What waits
@@ -174,8 +165,7 @@ def drain(scene, k, reach, level, left, top, pixels, width, noted):
 
     Args:
         reach: key that no hit still to come exceeds.
-        level: slots in use before.
-        left, top: first column and row of the band; pixels: in it.
+        level: slots in use before; pixels: in the band.
     """
     one, none, t_min, infinite = (
         scene.limits.one, scene.limits.none, scene.limits.t_min,
@@ -191,9 +181,8 @@ def drain(scene, k, reach, level, left, top, pixels, width, noted):
             now = (key >= near) & (key < infinite) & (through >= t_min)
             word = bits(now)
             if word != 0:
-                pixel = (top + first // TILE_WIDTH) * width + left + first % TILE_WIDTH
-                opacity = load(k.dims, at)
-                blend(scene, k, word, first, pixel, through, through * opacity, load(k.ids, at), noted)
+                opacity = gather(k.opacity, load(k.ids, at))
+                blend(scene, k, replay, now, first, through, through * opacity, load(k.ids, at), noted)
                 through = choose(now, through * (one - opacity), through)
             store(k.keys, at, choose(key >= near, infinite, key))
             slot += 1
@@ -218,7 +207,8 @@ def drain(scene, k, reach, level, left, top, pixels, width, noted):
                 continue
             slots = slot + 1
             waits = (key > none) & (key < infinite)
-            through = choose(waits, through * (one - load(k.dims, slot * scene.plane + first)), through)
+            opacity = gather(k.opacity, load(k.ids, slot * scene.plane + first))
+            through = choose(waits, through * (one - opacity), through)
             floor = choose(waits & (through < t_min), maximum(floor, key), floor)
         store(k.floor, first, floor)
         in_use = max(in_use, slots)

@@ -18,7 +18,7 @@ from numba.extending import intrinsic, models, register_model
 __all__ = [
     "LANES", "any_lane", "bits", "choose", "count_bits", "count_trailing_zeros", "first_lanes", "floor", "gather",
     "gather_pairs", "is_nan", "lane_numbers", "load", "load_where", "maximum", "minimum", "ramp", "spread", "store",
-    "store_where", "to_int", "to_wide", "total", "transpose",
+    "store_where", "to_int", "to_real", "total", "transpose",
 ]  # fmt: skip
 
 LANES = 8
@@ -216,12 +216,12 @@ def store_where(typingctx: Any, base: Any, index: Any, value: Any, mask: Any) ->
 
 
 def _wide(builder: Any, offset: Any, lane: int) -> Any:
-    return builder.sext(builder.extract_element(offset, ir.Constant(_I32, lane)), _I64)
+    return builder.zext(builder.extract_element(offset, ir.Constant(_I32, lane)), _I64)
 
 
 @intrinsic
 def gather(typingctx: Any, base: Any, offset: Any) -> Any:
-    """Elements at int32 offsets from a pointer.
+    """Elements at int32 offsets from a pointer, none of them negative.
 
     One load a lane: the processors' own gather instructions are slower than that where they are mended
     against leaks between programs.
@@ -239,7 +239,7 @@ def gather(typingctx: Any, base: Any, offset: Any) -> Any:
 
 @intrinsic
 def gather_pairs(typingctx: Any, base: Any, offset: Any) -> Any:
-    """Elements at int32 offsets from a pointer, and those after them."""
+    """Elements at int32 offsets from a pointer, none of them negative, and those after them."""
     lanes = _of(base.dtype)
     both = types.UniTuple(lanes, 2)
 
@@ -322,10 +322,10 @@ def to_int(typingctx: Any, a: Any) -> Any:
 
 
 @intrinsic
-def to_wide(typingctx: Any, a: Any) -> Any:
-    """int32 as int64."""
-    kind = ir.VectorType(_I64, LANES)
-    return Lanes("int64")(_WHOLE), lambda context, builder, sig, args: builder.sext(args[0], kind)
+def to_real(typingctx: Any, whole: Any, like: Any) -> Any:
+    """int32 as numbers of the type of the second argument."""
+    kind = ir.VectorType(_ELEMENTS[str(like)], LANES)
+    return _of(like)(_WHOLE, like), lambda context, builder, sig, args: builder.sitofp(args[0], kind)
 
 
 @intrinsic

@@ -273,11 +273,11 @@ def test_bad_input_is_refused_in_one_line():
 
 def test_a_scene_that_does_not_fit_says_so_before_allocating(monkeypatch):
     monkeypatch.setattr(binning, "available_memory", lambda: 1 << 20)
-    scene = [tensor.expand(4000, *tensor.shape[1:]).clone() for tensor in single(scale=50.0, dtype=torch.float32)]
-    scene[0][:, 2] += torch.arange(4000) * 1e-3
+    scene = [tensor.expand(8000, *tensor.shape[1:]).clone() for tensor in single(scale=50.0, dtype=torch.float32)]
+    scene[0][:, 2] += torch.arange(8000) * 1e-3
     view, K = camera(1024, 1024, dtype=torch.float32)
     start = time.perf_counter()
-    with pytest.raises(DeviceError, match="GiB for the tile lists of 4000"):
+    with pytest.raises(DeviceError, match="GiB for the tile lists of 8000"):
         render_gaussians(*scene, view, K, 1024, 1024)
     assert time.perf_counter() - start < 20
 
