@@ -13,8 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from nbavatar.errors import DeviceError
-from nbavatar.raster.compile import kernel
+from nbavatar.raster.compile import kernel, run_workers
 from nbavatar.raster.lanes import LANES
+from nbavatar.raster.memory import fetch_add
 from nbavatar.raster.projection import Projection
 
 __all__ = ["RECORD", "TILE_HEIGHT", "TILE_WIDTH", "Bins", "bin_billboards", "require_memory"]
@@ -22,6 +23,7 @@ __all__ = ["RECORD", "TILE_HEIGHT", "TILE_WIDTH", "Bins", "bin_billboards", "req
 TILE_WIDTH = 32  # pixels
 TILE_HEIGHT = 32
 RECORD = 16  # numbers in a billboard's record; see `pack`
+_CHUNK = 256  # billboards that a worker bins at a time
 _SLACK = 1e-3  # pixels by which bounds are widened, far more than rounding can move a corner
 
 
@@ -115,40 +117,45 @@ def _touches(plane, i, support, x0, y0, x1, y1):
 
 
 @kernel
-def count_entries(plane, box, sequence, support, first):
-    """Fills `first` with the running number of tiles that the billboards touch."""
-    total = 0
-    for k in range(len(sequence)):
-        first[k] = total
-        i = sequence[k]
-        if box[i, 2] <= box[i, 0]:
-            continue
-        for row in range(box[i, 1] // TILE_HEIGHT, (box[i, 3] - 1) // TILE_HEIGHT + 1):
-            y0, y1 = max(row * TILE_HEIGHT, box[i, 1]), min((row + 1) * TILE_HEIGHT, box[i, 3])
-            for column in range(box[i, 0] // TILE_WIDTH, (box[i, 2] - 1) // TILE_WIDTH + 1):
-                x0, x1 = max(column * TILE_WIDTH, box[i, 0]), min((column + 1) * TILE_WIDTH, box[i, 2])
-                if _touches(plane, i, support, x0, y0, x1, y1):
-                    total += 1
-    first[len(sequence)] = total
+def list_tiles(turn, chunk, plane, box, sequence, support, tiles_across, first, tile):
+    """Lists the tiles that the billboards touch, or, where `tile` is empty, counts them.
+
+    Args:
+        turn: (1,) int64, next place in `sequence`, shared by all workers; `chunk` are taken at a time.
+        first, tile: see Bins. While counting, first[k + 1] becomes the number of tiles of sequence[k].
+    """
+    counting = len(tile) == 0
+    while True:
+        begin = fetch_add(turn, chunk)
+        if begin >= len(sequence):
+            break
+        for k in range(begin, min(begin + chunk, len(sequence))):
+            i = sequence[k]
+            if counting:
+                first[k + 1] = 0
+            elif first[k] == first[k + 1]:
+                continue
+            if box[i, 2] <= box[i, 0]:
+                continue
+            entry = 0 if counting else first[k]
+            for row in range(box[i, 1] // TILE_HEIGHT, (box[i, 3] - 1) // TILE_HEIGHT + 1):
+                y0, y1 = max(row * TILE_HEIGHT, box[i, 1]), min((row + 1) * TILE_HEIGHT, box[i, 3])
+                for column in range(box[i, 0] // TILE_WIDTH, (box[i, 2] - 1) // TILE_WIDTH + 1):
+                    x0, x1 = max(column * TILE_WIDTH, box[i, 0]), min((column + 1) * TILE_WIDTH, box[i, 2])
+                    if _touches(plane, i, support, x0, y0, x1, y1):
+                        if not counting:
+                            tile[entry] = row * tiles_across + column
+                        entry += 1
+            if counting:
+                first[k + 1] = entry
 
 
 @kernel
-def fill_entries(plane, box, sequence, support, tiles_across, first, tile, where, start, members, room):
-    """Fills the lists of both orders; see `Bins`."""
+def sort_entries(box, sequence, tiles_across, first, tile, where, start, members, room):
+    """Fills the tile-major lists from `tile`; see `Bins`."""
     start[:] = 0
-    for k in range(len(sequence)):
-        entry = first[k]
-        if entry == first[k + 1]:
-            continue
-        i = sequence[k]
-        for row in range(box[i, 1] // TILE_HEIGHT, (box[i, 3] - 1) // TILE_HEIGHT + 1):
-            y0, y1 = max(row * TILE_HEIGHT, box[i, 1]), min((row + 1) * TILE_HEIGHT, box[i, 3])
-            for column in range(box[i, 0] // TILE_WIDTH, (box[i, 2] - 1) // TILE_WIDTH + 1):
-                x0, x1 = max(column * TILE_WIDTH, box[i, 0]), min((column + 1) * TILE_WIDTH, box[i, 2])
-                if _touches(plane, i, support, x0, y0, x1, y1):
-                    tile[entry] = row * tiles_across + column
-                    start[tile[entry] + 1] += 1
-                    entry += 1
+    for entry in range(len(tile)):
+        start[tile[entry] + 1] += 1
     for t in range(len(start) - 1):
         start[t + 1] += start[t]
     for k in range(len(sequence)):
@@ -211,13 +218,21 @@ def bin_billboards(
     sequence = sequence.astype(np.int32)
     across, down = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     first = np.zeros(count + 1, np.int64)
-    count_entries(plane, box, sequence, support, first)
+
+    def list_all(tile: NDArray[np.int32]) -> None:
+        turn = np.zeros(1, np.int64)
+        run_workers(lambda _: list_tiles(turn, _CHUNK, plane, box, sequence, support, across, first, tile))
+
+    list_all(np.zeros(0, np.int32))
+    np.cumsum(first, out=first)
     entries = int(first[-1])
     require_memory(entries * 16 + across * down * 8, f"the tile lists of {count} billboards ({entries} entries)")
     tile, members = np.zeros(entries, np.int32), np.zeros(entries, np.int32)
     where = np.zeros(entries, np.int64)
     start, room = np.zeros(across * down + 1, np.int64), np.zeros(across * down, np.int64)
-    fill_entries(plane, box, sequence, support, across, first, tile, where, start, members, room)
+    if entries:
+        list_all(tile)
+    sort_entries(box, sequence, across, first, tile, where, start, members, room)
     return Bins(record, box, sequence, place, first, tile, where, start, members, room)
 
 

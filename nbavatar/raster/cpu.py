@@ -269,10 +269,11 @@ def _prepare(dtype: torch.dtype) -> None:
             binning.pack: (
                 array(f64, 3), array(f64), array(f64), array(f64, 2), i64, i64, i64, f64, array(real, 2), array(i32, 2),
             ),
-            binning.count_entries: (array(f64, 3), array(i32, 2), array(i32), f64, array(i64)),
-            binning.fill_entries: (
-                array(f64, 3), array(i32, 2), array(i32), f64, i64, array(i64), array(i32), array(i64), array(i64),
-                array(i32), array(i64),
+            binning.list_tiles: (
+                array(i64), i64, array(f64, 3), array(i32, 2), array(i32), f64, i64, array(i64), array(i32),
+            ),
+            binning.sort_entries: (
+                array(i32, 2), array(i32), i64, array(i64), array(i32), array(i64), array(i64), array(i32), array(i64),
             ),
             cpu_blend.blend_tiles: (
                 array(i64), array(i32), array(i64), array(i32), array(real), array(i32, 2), array(i32), array(real),
