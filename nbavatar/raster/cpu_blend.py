@@ -12,7 +12,7 @@ Everything is done for eight pixels at a time, the texels of a hit in rows of ei
 import numpy as np
 
 from nbavatar.raster.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
-from nbavatar.raster.compile import kernel
+from nbavatar.raster.compile import inlined, kernel
 from nbavatar.raster.cpu_groups import COLUMN, ROW, list_groups, locate, sample
 from nbavatar.raster.cpu_hits import INFINITE, LOWEST, NONE, ONE, SIZE, ZERO, patch_of, read_limits, spans
 from nbavatar.raster.cpu_pixels import Scene, blend, close, divide, evaluate, keep_worth, settle, write
@@ -25,6 +25,63 @@ __all__ = ["blend_tiles", "note_tiles"]
 _PATIENCE = 2048  # hits that wait in a tile's queues before it is looked which of them are final
 _CROWD = 64  # hits that wait at one pixel of unsorted queues before the same
 _AHEAD = 512  # texels of the next billboard's opacity that are asked for in advance
+
+
+@inlined
+def _interpolate(scene, k, replay, texture, found, groups, noted, left, top, width, spots):
+    """Evaluates the features of a billboard's groups with a hit; the replay also notes where the groups are.
+
+    Args:
+        texture: number of the billboard's first feature.
+        found: groups with a hit, in `order`; groups: that the band had before.
+        noted: place of the band's first group among the notes.
+    """
+    features, nothing = ahead(scene.features, texture), scene.limits.zero
+    for m in range(found):
+        j, group = np.int64(get(k.order, m)), groups + m
+        if replay:
+            first = np.int64(get(k.first, j))
+            x, y = left + (first & COLUMN), top + (first >> ROW)
+            evaluate(scene, k, features, j, k.features)
+            keep_worth(scene, k, j, group, y * width + x)
+            at = noted + group
+            store(scene.notes, 2 * LANES * at, nothing)
+            store(scene.notes, 2 * LANES * at + LANES, nothing)
+            put(spots, 2 * at, x)
+            put(spots, 2 * at + 1, y)
+        else:
+            evaluate(scene, k, features, j, ahead(k.features, group * LANES * scene.stride))
+
+
+@inlined
+def _wait(scene, k, replay, queue, unsorted, found, groups, noted, level):
+    """Has the hits found wait for their turn, or blends them where the order is the billboards'.
+
+    Returns:
+        Slots of the queues in use, and pixels that this has finished.
+    """
+    one, none, finished = scene.limits.one, scene.limits.none, 0
+    for m in range(found):
+        j, group = np.int64(get(k.order, m)), groups + m
+        first, key = np.int64(get(k.first, j)), load(k.key, j * LANES)
+        ids = spread(np.int32(group * LANES)) + lane_numbers()
+        if queue == 0:
+            hit = key > none
+            through, opaque = load(k.through, first), load(k.opacity, group * LANES)
+            blend(scene, k, replay, hit, first, through, through * opaque, ids, noted)
+            through = choose(hit, through * (one - opaque), through)
+            store(k.through, first, through)
+            _, closed = close(scene, k, first, through)
+            finished += closed
+        elif unsorted:
+            level = append(scene, k, bits(key > none), key, ids, first, level)
+        else:
+            level = enqueue(scene, k, key, ids, first, level)
+            if queue > 0 and level > queue:
+                full = load(k.keys, queue * scene.plane + first) > none
+                if any_lane(full):
+                    finished += pop(scene, k, replay, first, full, level, noted)
+    return level, finished
 
 
 def _build(replay):
@@ -157,41 +214,9 @@ def _build(replay):
                     if broken:
                         status[1] = i + 1
                     waiting += hits
-                    for m in range(found):
-                        j, group = np.int64(get(k.order, m)), groups + m
-                        if replay:
-                            first = np.int64(get(k.first, j))
-                            x, y = left + (first & COLUMN), top + (first >> ROW)
-                            evaluate(scene, k, ahead(scene.features, texture * channels), j, k.features)
-                            keep_worth(scene, k, j, group, y * width + x)
-                            at = noted + group
-                            store(notes, 2 * LANES * at, scene.limits.zero)
-                            store(notes, 2 * LANES * at + LANES, scene.limits.zero)
-                            put(spots, 2 * at, x)
-                            put(spots, 2 * at + 1, y)
-                        else:
-                            own = ahead(k.features, group * LANES * stride)
-                            evaluate(scene, k, ahead(scene.features, texture * channels), j, own)
-                    for m in range(found):
-                        j, group = np.int64(get(k.order, m)), groups + m
-                        first, key = np.int64(get(k.first, j)), load(k.key, j * LANES)
-                        hit = key > scene.limits.none
-                        ids = spread(np.int32(group * LANES)) + lane_numbers()
-                        if queue == 0:
-                            through, opaque = load(k.through, first), load(k.opacity, group * LANES)
-                            blend(scene, k, replay, hit, first, through, through * opaque, ids, noted)
-                            through = choose(hit, through * (scene.limits.one - opaque), through)
-                            store(k.through, first, through)
-                            _, finished = close(scene, k, first, through)
-                            active -= finished
-                        elif unsorted:
-                            level = append(scene, k, bits(hit), key, ids, first, level)
-                        else:
-                            level = enqueue(scene, k, key, ids, first, level)
-                            if queue > 0 and level > queue:
-                                full = load(k.keys, queue * plane + first) > scene.limits.none
-                                if any_lane(full):
-                                    active -= pop(scene, k, replay, first, full, level, noted)
+                    _interpolate(scene, k, replay, texture * channels, found, groups, noted, left, top, width, spots)
+                    level, finished = _wait(scene, k, replay, queue, unsorted, found, groups, noted, level)
+                    active -= finished
                     groups += found
                     if replay:
                         at = 2 * ((top - tile_top) // rows * len(members_) + entry)
