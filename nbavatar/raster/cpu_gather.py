@@ -171,7 +171,7 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
     k, alphas = pointer(real, 0), pointer(real, 16 * LANES)
     totals = pointer(real, 16 * LANES + area * LANES)
     scale = 0.5 * (texels - 1) if texels > 1 else 1.0
-    shift = 0.5 * (texels - 1)
+    middle = spread(zero + np.float32(0.5 * (texels - 1)))  # of a texture: where its plane's coordinates are 0
     for j in range(16 * LANES):
         put(k, j, zero)
     while True:
@@ -247,7 +247,9 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
                         )  # fmt: skip
                         by_s = by_s + share * mix(d00, d01, d10, d11, a0, a1, foot.y0, foot.y1)
                         by_t = by_t + share * mix(d00, d01, d10, d11, foot.x0, foot.x1, b0, b1)
-                        gs, gt, gw = plane_slopes(choose(hit, by_s, none), choose(hit, by_t, none), s, t, p)
+                        gs, gt, gw = plane_slopes(
+                            choose(hit, by_s, none), choose(hit, by_t, none), s - middle, t - middle, p
+                        )
                         s_x, s_y, s_1 = s_x + gs * dx, s_y + gs * dy, s_1 + gs
                         t_x, t_y, t_1 = t_x + gt * dx, t_y + gt * dy, t_1 + gt
                         w_x, w_y, w_1 = w_x + gw * dx, w_y + gw * dy, w_1 + gw
@@ -280,7 +282,7 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
             grad_plane[i, 1, 0] += scale * t_x1
             grad_plane[i, 1, 1] += scale * t_y1
             grad_plane[i, 1, 2] += scale * t_11
-            grad_plane[i, 2, 0] += w_x1 + shift * (s_x1 + t_x1)
-            grad_plane[i, 2, 1] += w_y1 + shift * (s_y1 + t_y1)
-            grad_plane[i, 2, 2] += w_11 + shift * (s_11 + t_11)
+            grad_plane[i, 2, 0] += w_x1
+            grad_plane[i, 2, 1] += w_y1
+            grad_plane[i, 2, 2] += w_11
             grad_fade[i] += np.float64(total(g_fade))

@@ -64,7 +64,7 @@ def finish(sums, box, texels, grad_plane, grad_fade):
     i = cuda.grid(1)
     if i >= box.shape[0]:
         return
-    scale, shift = (0.5 * (texels - 1), 0.5 * (texels - 1)) if texels > 1 else (1.0, 0.0)
+    scale = 0.5 * (texels - 1) if texels > 1 else 1.0
     ox, oy = (box[i, 0] + box[i, 2]) // 2 + 0.5, (box[i, 1] + box[i, 3]) // 2 + 0.5
     for j in range(3):
         origin = ox if j == 0 else oy
@@ -75,7 +75,7 @@ def finish(sums, box, texels, grad_plane, grad_fade):
             w += sums[SUMS * i + 8] * origin
         grad_plane[i, 0, j] = scale * s
         grad_plane[i, 1, j] = scale * t
-        grad_plane[i, 2, j] = w + shift * (s + t)
+        grad_plane[i, 2, j] = w
     grad_fade[i] = sums[SUMS * i + 9]
 
 
@@ -196,7 +196,8 @@ def traverse(real: Any, channels: int, capacity: int, mode: int, replay: bool) -
             cuda.atomic.add(grad_features, first + right + c, by_colour * y0 * x1)
             cuda.atomic.add(grad_features, first + below + c, by_colour * y1 * x0)
             cuda.atomic.add(grad_features, first + below + right + c, by_colour * y1 * x1)
-        gs, gt, gw = plane_slopes(by_s, by_t, s, t, p)
+        middle = (size - one) * real(0.5)  # of a texture: where its plane's coordinates are 0
+        gs, gt, gw = plane_slopes(by_s, by_t, s - middle, t - middle, p)
         at = SUMS * member
         cuda.atomic.add(sums, at, np.float64(gs * dx))
         cuda.atomic.add(sums, at + 1, np.float64(gs * dy))

@@ -74,7 +74,11 @@ def build(jit: Callable[[Function], Function], floor: Function, minimum: Functio
 
     @jit
     def plane_slopes(grad_s, grad_t, s, t, r):
-        """Gradients by p_s, p_t, p_w of texel coordinates s = p_s / p_w, t = p_t / p_w; r = 1 / p_w."""
+        """Gradients by p_s, p_t, p_w of coordinates s = p_s / p_w, t = p_t / p_w; r = 1 / p_w.
+
+        Wherever the coordinates count from. From the texture's middle, as those of `Projection.plane` do, the
+        result is that plane's gradient as it stands: a shift afterwards would subtract large sums.
+        """
         return grad_s * r, grad_t * r, -(grad_s * s + grad_t * t) * r
 
     return Scalars(affine, first_texel, weights, slopes, mix, plane_slopes)
