@@ -13,12 +13,12 @@ import torch
 from numpy.typing import NDArray
 
 from nbavatar.errors import DeviceError
-from nbavatar.raster.compile import kernel, run_workers
+from nbavatar.raster.compile import inlined, kernel, run_workers
 from nbavatar.raster.lanes import LANES
 from nbavatar.raster.memory import fetch_add
 from nbavatar.raster.projection import Projection
 
-__all__ = ["RECORD", "TILE_HEIGHT", "TILE_WIDTH", "Bins", "bin_billboards", "require_memory"]
+__all__ = ["RECORD", "TILE_HEIGHT", "TILE_WIDTH", "Bins", "bin_billboards", "require_memory", "tile_bounds"]
 
 TILE_WIDTH = 32  # pixels
 TILE_HEIGHT = 32
@@ -116,13 +116,21 @@ def _touches(plane, i, support, x0, y0, x1, y1):
     return True
 
 
+@inlined
+def tile_bounds(tile, across, width, height):
+    """Pixels `x0, y0, x1, y1` of a tile, the last two excluded; `across` tiles lie side by side."""
+    left, top = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
+    return left, top, min(left + TILE_WIDTH, width), min(top + TILE_HEIGHT, height)
+
+
 @kernel
-def list_tiles(turn, chunk, plane, box, sequence, support, tiles_across, first, tile):
+def list_tiles(turn, chunk, plane, box, sequence, support, tiles_across, first, tile, groups):
     """Lists the tiles that the billboards touch, or, where `tile` is empty, counts them.
 
     Args:
         turn: (1,) int64, next place in `sequence`, shared by all workers; `chunk` are taken at a time.
         first, tile: see Bins. While counting, first[k + 1] becomes the number of tiles of sequence[k].
+        groups: (E,) int32, groups of `LANES` neighbouring pixels that the billboard can fill in the tile.
     """
     counting = len(tile) == 0
     while True:
@@ -145,15 +153,17 @@ def list_tiles(turn, chunk, plane, box, sequence, support, tiles_across, first, 
                     if _touches(plane, i, support, x0, y0, x1, y1):
                         if not counting:
                             tile[entry] = row * tiles_across + column
+                            groups[entry] = (x1 - x0 + LANES - 1) // LANES * (y1 - y0)
                         entry += 1
             if counting:
                 first[k + 1] = entry
 
 
 @kernel
-def sort_entries(box, sequence, tiles_across, first, tile, where, start, members, room):
-    """Fills the tile-major lists from `tile`; see `Bins`."""
+def sort_entries(sequence, first, tile, groups, where, start, members, room):
+    """Fills the tile-major lists from `tile` and `groups`; see `Bins` and `list_tiles`."""
     start[:] = 0
+    room[:] = 0
     for entry in range(len(tile)):
         start[tile[entry] + 1] += 1
     for t in range(len(start) - 1):
@@ -164,17 +174,10 @@ def sort_entries(box, sequence, tiles_across, first, tile, where, start, members
             where[entry] = start[t]
             members[start[t]] = sequence[k]
             start[t] += 1
+            room[t] += groups[entry]
     for t in range(len(start) - 1, 0, -1):
         start[t] = start[t - 1]
     start[0] = 0
-    for t in range(len(start) - 1):
-        left, top = t % tiles_across * TILE_WIDTH, t // tiles_across * TILE_HEIGHT
-        room[t] = 0
-        for position in range(start[t], start[t + 1]):
-            i = members[position]
-            across = min(box[i, 2], left + TILE_WIDTH) - max(box[i, 0], left)
-            down = min(box[i, 3], top + TILE_HEIGHT) - max(box[i, 1], top)
-            room[t] += (across + LANES - 1) // LANES * down
 
 
 def bin_billboards(
@@ -219,20 +222,20 @@ def bin_billboards(
     across, down = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     first = np.zeros(count + 1, np.int64)
 
-    def list_all(tile: NDArray[np.int32]) -> None:
+    def list_all(tile: NDArray[np.int32], groups: NDArray[np.int32]) -> None:
         turn = np.zeros(1, np.int64)
-        run_workers(lambda _: list_tiles(turn, _CHUNK, plane, box, sequence, support, across, first, tile))
+        run_workers(lambda _: list_tiles(turn, _CHUNK, plane, box, sequence, support, across, first, tile, groups))
 
-    list_all(np.zeros(0, np.int32))
+    list_all(np.zeros(0, np.int32), np.zeros(0, np.int32))
     np.cumsum(first, out=first)
     entries = int(first[-1])
-    require_memory(entries * 16 + across * down * 8, f"the tile lists of {count} billboards ({entries} entries)")
-    tile, members = np.zeros(entries, np.int32), np.zeros(entries, np.int32)
+    require_memory(entries * 20 + across * down * 8, f"the tile lists of {count} billboards ({entries} entries)")
+    tile, groups, members = (np.zeros(entries, np.int32) for _ in range(3))
     where = np.zeros(entries, np.int64)
     start, room = np.zeros(across * down + 1, np.int64), np.zeros(across * down, np.int64)
     if entries:
-        list_all(tile)
-    sort_entries(box, sequence, across, first, tile, where, start, members, room)
+        list_all(tile, groups)
+    sort_entries(sequence, first, tile, groups, where, start, members, room)
     return Bins(record, box, sequence, place, first, tile, where, start, members, room)
 
 

@@ -21,7 +21,7 @@ from nbavatar.raster.reference import BlendSettings
 
 __all__ = ["blend_cpu", "count_samples"]
 
-_QUEUE = 32  # hits that may wait at a pixel; a tile that needs more is done again with room for all
+_QUEUE = 64  # hits that may wait at a pixel; where half of them have to stay, a tile is done again with room for all
 _NOTES = 1 << 23  # groups of hits noted at once in the backward pass: 576 MiB in float32
 _SCRATCH = 1 << 26  # bytes that a worker may use; fewer rows are worked on at once beyond it
 
@@ -218,8 +218,9 @@ class _Scene:
             workers * self._bytes(plan.rows, plan.capacity, plan.groups), f"queues of {plan.capacity} hits a pixel"
         )
         reals, wholes = cpu_pixels.scratch_sizes(plan.rows, plan.capacity, self.channels, plan.groups, replay)
-        values = [self.texels, self.channels, s.width, s.height, self.across, s.queue, plan.capacity, plan.rows,
-                  plan.groups, int(s.queue < 0 and plan.capacity > _QUEUE)]  # fmt: skip
+        values = [
+            self.texels, self.channels, s.width, s.height, self.across, s.queue, plan.capacity, plan.rows, plan.groups,
+        ]  # fmt: skip
         shape = np.array(values, np.int64)
         turn = np.zeros(1, np.int64)
 
@@ -270,10 +271,10 @@ def _prepare(dtype: torch.dtype) -> None:
                 array(f64, 3), array(f64), array(f64), array(f64, 2), i64, i64, i64, f64, array(real, 2), array(i32, 2),
             ),
             binning.list_tiles: (
-                array(i64), i64, array(f64, 3), array(i32, 2), array(i32), f64, i64, array(i64), array(i32),
+                array(i64), i64, array(f64, 3), array(i32, 2), array(i32), f64, i64, array(i64), array(i32), array(i32),
             ),
             binning.sort_entries: (
-                array(i32, 2), array(i32), i64, array(i64), array(i32), array(i64), array(i64), array(i32), array(i64),
+                array(i32), array(i64), array(i32), array(i32), array(i64), array(i64), array(i32), array(i64),
             ),
             cpu_blend.blend_tiles: (
                 array(i64), array(i32), array(i64), array(i32), array(real), array(i32, 2), array(i32), array(real),

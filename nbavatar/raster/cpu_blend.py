@@ -11,19 +11,19 @@ Everything is done for eight pixels at a time, the texels of a hit in rows of ei
 
 import numpy as np
 
-from nbavatar.raster.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
+from nbavatar.raster.binning import RECORD, TILE_WIDTH, tile_bounds
 from nbavatar.raster.compile import inlined, kernel
 from nbavatar.raster.cpu_groups import COLUMN, ROW, list_groups, locate, sample
 from nbavatar.raster.cpu_hits import INFINITE, LOWEST, NONE, ONE, SIZE, ZERO, patch_of, read_limits, spans
 from nbavatar.raster.cpu_pixels import Scene, blend, close, divide, evaluate, keep_worth, settle, write
-from nbavatar.raster.cpu_queue import append, arrange, count_waiting, drain, enqueue, pop
-from nbavatar.raster.lanes import LANES, any_lane, bits, choose, lane_numbers, load, spread, store
+from nbavatar.raster.cpu_queue import append, drain, enqueue, pop
+from nbavatar.raster.lanes import LANES, any_lane, choose, first_lanes, lane_numbers, load, spread, store
 from nbavatar.raster.memory import ahead, fetch_add, get, pointer, prefetch, put
+from nbavatar.raster.sorting import LONGEST
 
 __all__ = ["blend_tiles", "note_tiles"]
 
 _PATIENCE = 2048  # hits that wait in a tile's queues before it is looked which of them are final
-_CROWD = 64  # hits that wait at one pixel of unsorted queues before the same
 _AHEAD = 512  # texels of the next billboard's opacity that are asked for in advance
 
 
@@ -54,33 +54,36 @@ def _interpolate(scene, k, replay, texture, found, groups, noted, left, top, wid
 
 
 @inlined
-def _wait(scene, k, replay, queue, unsorted, found, groups, noted, level):
+def _wait(scene, k, replay, queue, found, groups, noted, level, capacity):
     """Has the hits found wait for their turn, or blends them where the order is the billboards'.
 
     Returns:
-        Slots of the queues in use, and pixels that this has finished.
+        Slots of the queues in use, or as many as there are if one is full, and pixels that this has finished.
     """
     one, none, finished = scene.limits.one, scene.limits.none, 0
+    last, full = spread(np.int32(capacity - 1)), first_lanes(0)
     for m in range(found):
         j, group = np.int64(get(k.order, m)), groups + m
         first, key = np.int64(get(k.first, j)), load(k.key, j * LANES)
-        ids = spread(np.int32(group * LANES)) + lane_numbers()
         if queue == 0:
             hit = key > none
             through, opaque = load(k.through, first), load(k.opacity, group * LANES)
+            ids = spread(np.int32(group * LANES)) + lane_numbers()
             blend(scene, k, replay, hit, first, through, through * opaque, ids, noted)
             through = choose(hit, through * (one - opaque), through)
             store(k.through, first, through)
             _, closed = close(scene, k, first, through)
             finished += closed
-        elif unsorted:
-            level = append(scene, k, bits(key > none), key, ids, first, level)
+        elif queue < 0:
+            full = full | (append(scene, k, key, group, first) > last)
         else:
-            level = enqueue(scene, k, key, ids, first, level)
-            if queue > 0 and level > queue:
-                full = load(k.keys, queue * scene.plane + first) > none
-                if any_lane(full):
-                    finished += pop(scene, k, replay, first, full, level, noted)
+            level = enqueue(scene, k, key, group, first, level)
+            if level > queue:
+                over = load(k.keys, queue * scene.plane + first) > none
+                if any_lane(over):
+                    finished += pop(scene, k, replay, first, over, level, noted)
+    if queue < 0 and found > 0:
+        level = capacity if any_lane(full) else max(level, 1)
     return level, finished
 
 
@@ -102,7 +105,7 @@ def _build(replay):
             features, alpha: textures, flat.
             limits: see `cpu_hits`.
             shape: texels, channels, width, height, tiles across, queue, capacity of a queue, rows worked on at
-                once, groups that there is room for, whether hits wait unsorted.
+                once, groups that there is room for.
             image, opacity: (C, H, W), (H, W) results, flat; not written in the replay.
             grads: (H, W, stride) flat, gradients of the image, filled up with zeros; grad_opacity: (H, W) flat. These
                 and what follows are used in the replay.
@@ -118,7 +121,6 @@ def _build(replay):
         texels, channels, width, height, across, queue, capacity, rows, room = (
             shape[0], shape[1], shape[2], shape[3], shape[4], shape[5], shape[6], shape[7], shape[8],
         )  # fmt: skip
-        unsorted = shape[9] != 0
         members, record, rank = pointer(members_, 0), pointer(record_, 0), pointer(rank_, 0)
         alpha, limits = pointer(alpha_, 0), pointer(limits_, 0)
         image, opacity = pointer(image_, 0), pointer(opacity_, 0)
@@ -133,8 +135,7 @@ def _build(replay):
             step * (texels + 1) * channels, channels, stride, plane, room * LANES,
             pointer(grads_, 0), pointer(grad_opacity_, 0), notes, pointer(status, 0),
         )  # fmt: skip
-        for i in range(capacity * plane):
-            put(k.keys, i, none)
+        for i in range(max(capacity, LONGEST) * plane):  # a free place's number is looked up as well
             put(k.ids, i, 0)
         if not replay:
             for i in range(stride):
@@ -144,8 +145,7 @@ def _build(replay):
             if position >= len(tiles):
                 break
             tile = tiles[position]
-            left, tile_top = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
-            right, tile_bottom = min(left + TILE_WIDTH, width), min(tile_top + TILE_HEIGHT, height)
+            left, tile_top, right, tile_bottom = tile_bounds(tile, across, width, height)
             first_entry, end_entry = start[tile], start[tile + 1]
             noted = made[tile] - base if replay else 0
             total_groups, hits_before = 0, status[2]
@@ -166,12 +166,13 @@ def _build(replay):
                 else:
                     for i in range(pixels * stride):
                         put(k.sums, i, zero)
-                if unsorted:
-                    for i in range(plane):
-                        put(k.count, i, 0)
-                crowded = _CROWD if unsorted else capacity
+                for i in range(plane):
+                    put(k.count, i, 0)
+                if queue > 0:
+                    for i in range(capacity * plane):
+                        put(k.keys, i, none)
                 active = (bottom - top) * (right - left)
-                level, groups, waiting = 0, 0, 0
+                level, groups, waiting, patience = 0, 0, 0, _PATIENCE
                 for entry in range(first_entry, end_entry + 1):
                     final = entry == end_entry
                     i = 0
@@ -179,18 +180,16 @@ def _build(replay):
                     if not final:
                         i = get(members, entry)
                         reach = get(record, i * RECORD + 11)
-                    patient = unsorted or waiting < _PATIENCE
-                    if level > 0 and (final or (queue < 0 and (level >= crowded or not patient))):
-                        if unsorted:
-                            arrange(scene, k, pixels)
-                        level, finished = drain(scene, k, replay, reach, level, pixels, noted)
+                    if level > 0 and (final or (queue < 0 and (level == capacity or waiting >= patience))):
+                        if queue > 0:
+                            for i in range(plane):
+                                put(k.count, i, level)
+                        full = level == capacity
+                        level, stay, finished = drain(scene, k, replay, reach, pixels, noted)
                         active -= finished
-                        waiting = 0
-                        if unsorted:  # next when the longest queue has doubled: the sorting stays in proportion
-                            count_waiting(scene, k, pixels, level, none)
-                            crowded = max(_CROWD, 2 * level)
-                        else:
-                            overflow = level == capacity and not final
+                        # As many must come as have stayed, so that the sorting stays in proportion.
+                        waiting, patience = 0, max(_PATIENCE, stay)
+                        overflow = full and 2 * level > capacity and not final
                     if final or overflow or active == 0:
                         break
                     first_group = groups
@@ -215,7 +214,7 @@ def _build(replay):
                         status[1] = i + 1
                     waiting += hits
                     _interpolate(scene, k, replay, texture * channels, found, groups, noted, left, top, width, spots)
-                    level, finished = _wait(scene, k, replay, queue, unsorted, found, groups, noted, level)
+                    level, finished = _wait(scene, k, replay, queue, found, groups, noted, level, capacity)
                     active -= finished
                     groups += found
                     if replay:
@@ -223,8 +222,6 @@ def _build(replay):
                         put(ranges, at, first_group + total_groups)
                         put(ranges, at + 1, groups + total_groups)
                 if overflow:
-                    for i in range(capacity * plane):
-                        put(k.keys, i, none)
                     break
                 noted += groups
                 total_groups += groups

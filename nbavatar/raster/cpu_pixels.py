@@ -18,16 +18,19 @@ from nbavatar.raster.lanes import (
     spread,
     store,
     store_where,
+    stream,
     transpose,
 )  # fmt: skip
 from nbavatar.raster.memory import ahead, get, pointer, put
+from nbavatar.raster.sorting import LONGEST
 
 __all__ = [
-    "LANE", "SHIFT", "Scene", "Scratch", "blend", "close", "divide", "evaluate", "keep_worth", "scratch_sizes",
+    "LANE", "LARGE", "SHIFT", "Scene", "Scratch", "blend", "close", "divide", "evaluate", "keep_worth", "scratch_sizes",
     "settle", "write",
 ]  # fmt: skip
 
 SHIFT, LANE = 3, LANES - 1  # a hit's number is LANES * group + lane
+LARGE = 1 << 22  # numbers of an image that the caches do not hold
 _GROUPS = TILE_HEIGHT * (TILE_WIDTH // LANES) + LANES  # of one billboard in a tile; lists are filled LANES at a time
 
 
@@ -38,10 +41,11 @@ class Scratch(NamedTuple):
     through: Any  # transmittance
     floor: Any  # hits with a smaller key than this are of no use to the pixel
     sums: Any  # blended features, `stride` a pixel
-    count: Any  # slots in use, where hits are put behind the queues unsorted
+    count: Any  # hits that wait
     last: Any  # replay: the hit blended last
-    # queues of hits, `plane` a slot
-    keys: Any  # an empty place holds -infinity
+    # queues of hits, `plane` a slot, LONGEST slots at least
+    keys: Any
+    opacities: Any
     ids: Any  # numbers of the hits
     # of the band's hits
     opacity: Any
@@ -66,10 +70,10 @@ def scratch_sizes(rows: int, capacity: int, channels: int, groups: int, replay: 
     """Numbers and int32 that a worker needs for bands of `rows` rows with `groups` groups of hits; see `divide`."""
     plane = TILE_WIDTH * rows + LANES
     stride = -(-channels // LANES) * LANES
-    hits = groups * LANES
+    hits, slots = groups * LANES, max(capacity, LONGEST)
     features = LANES * stride + hits if replay else (hits + 1) * stride
-    reals = plane * (2 + stride + capacity) + hits + LANES + features + 5 * LANES * _GROUPS + LANES
-    wholes = plane * (1 + capacity) + groups + 1 + (LANES + 3) * _GROUPS + 2 * TILE_HEIGHT + LANES
+    reals = plane * (2 + stride + 2 * slots) + hits + LANES + features + 5 * LANES * _GROUPS + LANES
+    wholes = plane * (1 + slots) + groups + 1 + (LANES + 3) * _GROUPS + 2 * TILE_HEIGHT + LANES
     return reals, wholes + (hits + plane if replay else 0)
 
 
@@ -79,16 +83,17 @@ def divide(real, whole, plane, stride, capacity, groups, replay):
 
     Opacities and ranks have room for a group more, which is written before it is known whether it has a hit.
     """
-    hits = groups * LANES
+    hits, slots = groups * LANES, max(capacity, LONGEST)
     floor, sums, keys = plane, 2 * plane, (2 + stride) * plane
-    opacity = keys + capacity * plane
+    opacities = keys + slots * plane
+    opacity = opacities + slots * plane
     key = opacity + hits + LANES
     weights = key + LANES * _GROUPS
     row = weights + 4 * LANES * _GROUPS
     features = row + LANES
     worth = features + LANES * stride
     ids = plane
-    rank = ids + capacity * plane
+    rank = ids + slots * plane
     cell = rank + groups + 1
     first = cell + LANES * _GROUPS
     rest, order, ends = first + _GROUPS, first + 2 * _GROUPS, first + 3 * _GROUPS
@@ -99,7 +104,7 @@ def divide(real, whole, plane, stride, capacity, groups, replay):
         worth, last, before = 0, 0, 0
     return Scratch(
         pointer(real, 0), pointer(real, floor), pointer(real, sums), pointer(whole, 0), pointer(whole, last),
-        pointer(real, keys), pointer(whole, ids),
+        pointer(real, keys), pointer(real, opacities), pointer(whole, ids),
         pointer(real, opacity), pointer(real, features), pointer(real, worth), pointer(whole, before),
         pointer(whole, rank),
         pointer(real, key), pointer(real, weights), pointer(whole, cell), pointer(whole, first), pointer(whole, rest),
@@ -224,15 +229,20 @@ def close(scene, k, first, through):
 
 @inlined
 def write(scene, k, image, opacity, left, right, top, bottom, width, height):
-    """Writes a band's pixels into the results."""
+    """Writes a band's pixels into the results, which begin at multiples of 64 bytes."""
     one = scene.limits.one
     area, stride = np.int64(width) * height, scene.stride
+    # A large image is not in the caches when it is read: writing past them saves reading the memory first.
+    past = width % LANES == 0 and area * scene.channels >= LARGE
     for y in range(top, bottom):
         for x in range(left, right, LANES):
             used = first_lanes(right - x)
             first = (y - top) * TILE_WIDTH + x - left
             pixel = np.int64(y) * width + x
-            store_where(opacity, pixel, one - load(k.through, first), used)
+            if past:
+                stream(opacity, pixel, one - load(k.through, first))
+            else:
+                store_where(opacity, pixel, one - load(k.through, first), used)
             for c in range(0, scene.channels, LANES):
                 at = first * stride + c
                 columns = transpose((
@@ -241,7 +251,10 @@ def write(scene, k, image, opacity, left, right, top, bottom, width, height):
                     load(k.sums, at + 6 * stride), load(k.sums, at + 7 * stride),
                 ))  # fmt: skip
                 for lane in range(min(LANES, scene.channels - c)):
-                    store_where(image, (c + lane) * area + pixel, columns[lane], used)
+                    if past:
+                        stream(image, (c + lane) * area + pixel, columns[lane])
+                    else:
+                        store_where(image, (c + lane) * area + pixel, columns[lane], used)
 
 
 @inlined

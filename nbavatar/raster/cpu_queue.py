@@ -1,8 +1,8 @@
-"""Queues of hits, one a pixel, sorted by depth: the nearest in slot 0.
+"""Queues of hits, one a pixel, which wait until nothing nearer can come.
 
-They are stored slot by slot: slot j of all pixels, then slot j + 1. A new row of hits passes the slots from
-the nearest on and in each the nearer of two stays, so no branch depends on a single pixel. Where hundreds of
-hits wait at a pixel that is too slow: there they are put behind the queue and sorted before it is looked at.
+They are stored slot by slot: slot j of all pixels, then slot j + 1. In `ray` order a hit is put behind those that
+wait, and the queues are sorted when it is looked which hits are final, those of eight pixels at a time by the same
+comparisons: no branch depends on a single pixel. With a queue of n hits they are kept sorted, the nearest in slot 0.
 """
 
 import numpy as np
@@ -12,204 +12,201 @@ from nbavatar.raster.cpu_pixels import SHIFT, blend, close
 from nbavatar.raster.lanes import (
     LANES,
     any_lane,
-    bits,
     choose,
-    count_trailing_zeros,
     first_lanes,
     gather,
+    lane_numbers,
+    largest,
     load,
     maximum,
     spread,
     store,
+    truths,
 )  # fmt: skip
 from nbavatar.raster.memory import get, put
+from nbavatar.raster.sorting import LONGEST, network
 
-__all__ = ["append", "arrange", "count_waiting", "drain", "enqueue", "pop"]
+__all__ = ["append", "drain", "enqueue", "pop"]
+
+_sort_2, _sort_4, _sort_8, _sort_all = network(2), network(4), network(8), network(LONGEST)
 
 
 @inlined
-def enqueue(scene, k, key, ids, first, level):
-    """Puts hits into the queues of the pixels `first + lane`; returns how many slots are in use then.
+def append(scene, k, key, group, first):
+    """Puts hits behind the queues of the pixels `first + lane`; returns how many hits wait there then.
+
+    A lane without a hit is written as well, to a place that stays free.
+    """
+    count = load(k.count, first)
+    store(k.whole, 0, count * spread(np.int32(scene.plane)) + spread(np.int32(first)) + lane_numbers())
+    store(k.row, 0, key)
+    count = count + truths(key > scene.limits.none)
+    store(k.count, first, count)
+    for lane in range(LANES):
+        at, number = np.int64(get(k.whole, lane)), group * LANES + lane
+        put(k.keys, at, get(k.row, lane))
+        put(k.opacities, at, get(k.opacity, number))
+        put(k.ids, at, number)
+    return count
+
+
+@inlined
+def enqueue(scene, k, key, group, first, level):
+    """Puts hits into the sorted queues of the pixels `first + lane`; returns how many slots are in use then.
 
     Of equal keys the one of lower rank goes first.
     """
     none, shift = scene.limits.none, spread(np.int32(SHIFT))
+    ids, opacity = spread(np.int32(group * LANES)) + lane_numbers(), load(k.opacity, group * LANES)
     slot = 0
     while True:
         at = slot * scene.plane + first
-        held, held_id = load(k.keys, at), load(k.ids, at)
+        held, held_id, held_opacity = load(k.keys, at), load(k.ids, at), load(k.opacities, at)
         ahead = key > held
         tie = (key == held) & (key > none)
         if any_lane(tie):
             ahead = ahead | (tie & (gather(k.rank, ids >> shift) < gather(k.rank, held_id >> shift)))
         store(k.keys, at, choose(ahead, key, held))
         store(k.ids, at, choose(ahead, ids, held_id))
-        key, ids = choose(ahead, held, key), choose(ahead, held_id, ids)
+        store(k.opacities, at, choose(ahead, opacity, held_opacity))
+        key, ids, opacity = choose(ahead, held, key), choose(ahead, held_id, ids), choose(ahead, held_opacity, opacity)
         slot += 1
         if not any_lane(key > none):
             return max(level, slot)
 
 
 @inlined
-def append(scene, k, word, key, ids, first, level):
-    """Puts the hits with a bit in `word` behind the queues; returns how many slots are in use then."""
-    store(k.row, 0, key)
-    store(k.whole, 0, ids)
-    while word != 0:
-        lane = count_trailing_zeros(word)
-        word &= word - 1
-        pixel = first + lane
-        slot = np.int64(get(k.count, pixel))
-        put(k.keys, slot * scene.plane + pixel, get(k.row, lane))
-        put(k.ids, slot * scene.plane + pixel, get(k.whole, lane))
-        put(k.count, pixel, slot + 1)
-        level = max(level, slot + 1)
-    return level
-
-
-@inlined
-def _behind(k, key, number, other_key, other):
-    """Whether a hit is blended after another one."""
-    if key != other_key:
-        return key < other_key
-    return get(k.rank, number >> SHIFT) > get(k.rank, other >> SHIFT)
-
-
-@inlined
-def _sink(scene, k, pixel, slot, end, key, number):
-    """Moves a hit down from `slot` in the heap of the slots before `end`, the last one to be blended on top."""
-    while True:
-        child = 2 * slot + 1
-        if child >= end:
-            break
-        at = child * scene.plane + pixel
-        child_key, child_number = get(k.keys, at), np.int64(get(k.ids, at))
-        if child + 1 < end:
-            other_key = get(k.keys, at + scene.plane)
-            other_number = np.int64(get(k.ids, at + scene.plane))
-            if _behind(k, other_key, other_number, child_key, child_number):
-                child, child_key, child_number = child + 1, other_key, other_number
-        if not _behind(k, child_key, child_number, key, number):
-            break
-        put(k.keys, slot * scene.plane + pixel, child_key)
-        put(k.ids, slot * scene.plane + pixel, child_number)
-        slot = child
-    put(k.keys, slot * scene.plane + pixel, key)
-    put(k.ids, slot * scene.plane + pixel, number)
-
-
-@inlined
-def arrange(scene, k, pixels):
-    """Brings queues that were filled by `append` into the order that `enqueue` keeps, by heap sort."""
-    for pixel in range(pixels):
-        count = np.int64(get(k.count, pixel))
-        for step in range(count // 2 + count - 1):
-            if step < count // 2:  # builds the heap
-                slot, end = count // 2 - 1 - step, count
-                at = slot * scene.plane + pixel
-                key, number = get(k.keys, at), np.int64(get(k.ids, at))
-            else:  # takes the hit on top out to the end
-                slot, end = 0, count - 1 - (step - count // 2)
-                at = end * scene.plane + pixel
-                key, number = get(k.keys, at), np.int64(get(k.ids, at))
-                put(k.keys, at, get(k.keys, pixel))
-                put(k.ids, at, get(k.ids, pixel))
-            _sink(scene, k, pixel, slot, end, key, number)
-
-
-@inlined
-def count_waiting(scene, k, pixels, level, none):
-    """Counts the slots in use at each pixel, `level` at most; an empty one holds the key `none`."""
-    for pixel in range(pixels):
-        slot = 0
-        while slot < level and get(k.keys, slot * scene.plane + pixel) > none:
-            slot += 1
-        put(k.count, pixel, slot)
-
-
-@inlined
-def _shift(scene, k, first, slot, source, level, moved, done):
-    """Moves slot `source` of the pixels in the mask `moved` to `slot`; empties it for those that are done."""
-    none = scene.limits.none
-    to, at = slot * scene.plane + first, source * scene.plane + first
-    if source < level:
-        key = choose(done, none, choose(moved, load(k.keys, at), load(k.keys, to)))
-        store(k.ids, to, choose(moved, load(k.ids, at), load(k.ids, to)))
-    else:
-        key = choose(done | moved, none, load(k.keys, to))
-    store(k.keys, to, key)
-    return key
-
-
-@inlined
 def pop(scene, k, replay, first, full, level, noted):
     """Blends the nearest hit of the queues in the mask `full`; returns the number of pixels that this has finished."""
-    one = scene.limits.one
-    through, opacity = load(k.through, first), gather(k.opacity, load(k.ids, first))
+    one, none = scene.limits.one, scene.limits.none
+    through, opacity = load(k.through, first), load(k.opacities, first)
     blend(scene, k, replay, full, first, through, through * opacity, load(k.ids, first), noted)
     through = choose(full, through * (one - opacity), through)
     store(k.through, first, through)
     done, finished = close(scene, k, first, through)
     for slot in range(level):
-        _shift(scene, k, first, slot, slot + 1, level, full, done)
+        to, at = slot * scene.plane + first, (slot + 1) * scene.plane + first
+        key = load(k.keys, to)
+        if slot + 1 < level:
+            key = choose(full, load(k.keys, at), key)
+            store(k.ids, to, choose(full, load(k.ids, at), load(k.ids, to)))
+            store(k.opacities, to, choose(full, load(k.opacities, at), load(k.opacities, to)))
+        else:
+            key = choose(full, none, key)
+        store(k.keys, to, choose(done, none, key))
     return finished
 
 
 @inlined
-def drain(scene, k, replay, reach, level, pixels, noted):
-    """Blends all hits at least as near as `reach`; returns slots in use and pixels that this has finished.
+def _exchange(scene, k, a, b):
+    """Brings the hits at two places of the same queues in order: by key, equal ones by rank."""
+    key, other = load(k.keys, a), load(k.keys, b)
+    number, other_number = load(k.ids, a), load(k.ids, b)
+    opacity, other_opacity = load(k.opacities, a), load(k.opacities, b)
+    behind, tie = key < other, (key == other) & (key > scene.limits.none)
+    if any_lane(tie):
+        shift = spread(np.int32(SHIFT))
+        behind = behind | (tie & (gather(k.rank, other_number >> shift) < gather(k.rank, number >> shift)))
+    store(k.keys, a, choose(behind, other, key))
+    store(k.keys, b, choose(behind, key, other))
+    store(k.ids, a, choose(behind, other_number, number))
+    store(k.ids, b, choose(behind, number, other_number))
+    store(k.opacities, a, choose(behind, other_opacity, opacity))
+    store(k.opacities, b, choose(behind, opacity, other_opacity))
 
-    A blended hit stays in its slot, with the key infinity, until the slot can go for all lanes. What waits
-    tells from which key on hits can be ignored: where so little light comes through it that they would not
-    be blended.
+
+@inlined
+def _sort_any(scene, k, first, most):
+    """Sorts `most` slots of the queues `first + lane` by the comparisons of `sorting.comparisons`, one by one."""
+    top = 1
+    while 2 * top < most:
+        top *= 2
+    p = top
+    while p > 0:
+        q, r, d = top, 0, p
+        while True:
+            for i in range(most - d):
+                if i & p == r:
+                    _exchange(scene, k, i * scene.plane + first, (i + d) * scene.plane + first)
+            if q == p:
+                break
+            q, r, d = q // 2, p, q - p
+        p //= 2
+
+
+@inlined
+def _sort(scene, k, first, count, most):
+    """Sorts the queues `first + lane`, in which `count` hits wait, `most` at most."""
+    plane, none = scene.plane, scene.limits.none
+    if most <= 2:
+        tied = _sort_2(k.keys, k.opacities, k.ids, first, plane, count, none)
+    elif most <= 4:
+        tied = _sort_4(k.keys, k.opacities, k.ids, first, plane, count, none)
+    elif most <= 8:
+        tied = _sort_8(k.keys, k.opacities, k.ids, first, plane, count, none)
+    elif most <= LONGEST:
+        tied = _sort_all(k.keys, k.opacities, k.ids, first, plane, count, none)
+    else:
+        tied = first_lanes(0)
+        for slot in range(most):
+            at = slot * plane + first
+            store(k.keys, at, choose(count > spread(np.int32(slot)), load(k.keys, at), none))
+    if most > LONGEST or any_lane(tied):
+        _sort_any(scene, k, first, most)
+
+
+@inlined
+def drain(scene, k, replay, reach, pixels, noted):
+    """Blends all hits at least as near as `reach`; sorts the queues on the way.
+
+    What waits tells from which key on hits can be ignored: where so little light comes through it that they would
+    not be blended.
 
     Args:
         reach: key that no hit still to come exceeds.
-        level: slots in use before; pixels: in the band.
+        pixels: in the band.
+
+    Returns:
+        Slots still in use, about how many hits still wait, and pixels that this has finished.
     """
-    one, none, t_min, infinite = (
-        scene.limits.one, scene.limits.none, scene.limits.t_min,
-        scene.limits.infinite,
-    )  # fmt: skip
-    near = spread(reach)
-    in_use, finished = 0, 0
+    one, none, t_min = scene.limits.one, scene.limits.none, scene.limits.t_min
+    near, zero = spread(reach), spread(np.int32(0))
+    in_use, waiting, finished = 0, 0, 0
     for first in range(0, pixels, LANES):
-        key, through = load(k.keys, first), load(k.through, first)
-        slot, gone = 0, 0
-        while any_lane(key >= near):
+        count = load(k.count, first)
+        most = np.int64(largest(count))
+        if most == 0:
+            continue
+        _sort(scene, k, first, count, most)
+        through, floor = load(k.through, first), load(k.floor, first)
+        behind, held = through, zero  # transmittance behind all hits so far, and their number
+        gone = most  # slots in front of the first in which a hit has to wait
+        for slot in range(most):
             at = slot * scene.plane + first
-            now = (key >= near) & (key < infinite) & (through >= t_min)
-            word = bits(now)
-            if word != 0:
-                opacity = gather(k.opacity, load(k.ids, at))
-                blend(scene, k, replay, now, first, through, through * opacity, load(k.ids, at), noted)
+            key, opacity, ids = load(k.keys, at), load(k.opacities, at), load(k.ids, at)
+            some, final = key > none, key >= near
+            now = some & final & (through >= t_min)
+            if any_lane(now):
+                blend(scene, k, replay, now, first, through, through * opacity, ids, noted)
                 through = choose(now, through * (one - opacity), through)
-            store(k.keys, at, choose(key >= near, infinite, key))
-            slot += 1
-            if gone == slot - 1 and not any_lane((key > none) & (key < near)):
-                gone = slot
-            if slot == level:
-                break
-            key = load(k.keys, at + scene.plane)
+            behind = choose(some, behind * (one - opacity), behind)
+            held = held + truths(some)
+            waits = some & (key < near)
+            if gone < slot or any_lane(waits):
+                gone = min(gone, slot)
+                floor = choose(waits & (behind < t_min), maximum(floor, key), floor)
+                to = at - gone * scene.plane
+                store(k.keys, to, choose(waits, key, none))
+                store(k.opacities, to, opacity)
+                store(k.ids, to, ids)
         store(k.through, first, through)
-        done, count = close(scene, k, first, through)
-        finished += count
-        floor = load(k.floor, first)
-        every = first_lanes(LANES)
-        slots = 0
-        for slot in range(level):
-            key = load(k.keys, slot * scene.plane + first)
-            if gone > 0 or count > 0:
-                key = _shift(scene, k, first, slot, slot + gone, level, every, done)
-            if not any_lane(key > none):
-                if gone == 0 and count == 0:
-                    break
-                continue
-            slots = slot + 1
-            waits = (key > none) & (key < infinite)
-            opacity = gather(k.opacity, load(k.ids, slot * scene.plane + first))
-            through = choose(waits, through * (one - opacity), through)
-            floor = choose(waits & (through < t_min), maximum(floor, key), floor)
         store(k.floor, first, floor)
-        in_use = max(in_use, slots)
-    return in_use, finished
+        done, closed = close(scene, k, first, through)
+        finished += closed
+        held = held - spread(np.int32(gone))
+        held = choose(done, zero, choose(held > zero, held, zero))
+        store(k.count, first, held)
+        most = np.int64(largest(held))
+        in_use = max(in_use, most)
+        waiting += LANES * most
+    return in_use, waiting, finished

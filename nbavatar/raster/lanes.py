@@ -17,8 +17,8 @@ from numba.extending import intrinsic, models, register_model
 
 __all__ = [
     "LANES", "any_lane", "bits", "choose", "count_bits", "count_trailing_zeros", "first_lanes", "floor", "gather",
-    "gather_pairs", "is_nan", "lane_numbers", "load", "load_where", "maximum", "minimum", "ramp", "spread", "store",
-    "store_where", "to_int", "to_real", "total", "transpose",
+    "gather_pairs", "is_nan", "lane_numbers", "largest", "load", "load_where", "maximum", "minimum", "ramp", "spread",
+    "store", "store_where", "stream", "to_int", "to_real", "total", "transpose", "truths",
 ]  # fmt: skip
 
 LANES = 8
@@ -184,6 +184,19 @@ def store(typingctx: Any, base: Any, index: Any, value: Any) -> Any:
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         address, kind = _row(context, builder, args[0], args[1], base.dtype)
         builder.store(args[2], address, align=_size(kind))
+        return context.get_dummy_value()
+
+    return types.none(base, types.intp, _of(base.dtype)), generate
+
+
+@intrinsic
+def stream(typingctx: Any, base: Any, index: Any, value: Any) -> Any:
+    """Writes lanes from `index` on past the caches; their address is a multiple of their size."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address, kind = _row(context, builder, args[0], args[1], base.dtype)
+        written = builder.store(args[2], address, align=LANES * _size(kind))
+        written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(_I32, 1)]))
         return context.get_dummy_value()
 
     return types.none(base, types.intp, _of(base.dtype)), generate
@@ -371,6 +384,23 @@ def total(typingctx: Any, a: Any) -> Any:
         return builder.extract_element(value, ir.Constant(_I32, 0))
 
     return a.scalar(a), generate
+
+
+@intrinsic
+def largest(typingctx: Any, a: Any) -> Any:
+    """Greatest of int32 lanes."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _call(builder, f"llvm.vector.reduce.smax.{_suffix(args[0].type)}", _I32, [args[0]])
+
+    return types.int32(_WHOLE), generate
+
+
+@intrinsic
+def truths(typingctx: Any, mask: Any) -> Any:
+    """A mask as the int32 numbers 1 and 0."""
+    kind = ir.VectorType(_I32, LANES)
+    return _WHOLE(_MASK), lambda context, builder, sig, args: builder.zext(args[0], kind)
 
 
 @intrinsic

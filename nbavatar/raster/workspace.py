@@ -28,6 +28,7 @@ def _unused(position: int) -> bool:
 def empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     """Uninitialised array (...) of a dtype; its memory is free again once nothing refers to the array.
 
+    It begins at a multiple of 64 bytes.
     Up to 512 MiB of blocks are kept for their next use.
     """
     size = math.prod(shape) * dtype.itemsize

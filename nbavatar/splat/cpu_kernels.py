@@ -12,7 +12,7 @@ kernel adds those of a Gaussian up in a fixed order. Results do not depend on th
 
 import numpy as np
 
-from nbavatar.raster.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
+from nbavatar.raster.binning import RECORD, TILE_WIDTH, tile_bounds
 from nbavatar.raster.lanes import (
     LANES,
     bits,
@@ -86,8 +86,7 @@ def traverse(turn, tiles, start, members_, record_, box, colours_, limits_, shap
         if position >= len(tiles):
             break
         tile = tiles[position]
-        left, tile_top = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
-        right, tile_bottom = min(left + TILE_WIDTH, width), min(tile_top + TILE_HEIGHT, height)
+        left, tile_top, right, tile_bottom = tile_bounds(tile, across, width, height)
         if replay:
             for i in range(PARTS * start[tile], PARTS * start[tile + 1]):
                 put(parts, i, zero)

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from nbavatar.errors import DataError, DeviceError
-from nbavatar.raster import binning, cpu, render_billboards
+from nbavatar.raster import binning, cpu, cpu_pixels, render_billboards
 from nbavatar.raster.ordering import canonical_rank, parse_order
 from nbavatar.raster.projection import project_billboards, texture_support
 from nbavatar.raster.reference import BlendSettings, blend_reference, critical_pixels
@@ -161,6 +161,28 @@ def test_hundreds_of_hits_that_wait_at_a_pixel_are_blended_in_order():
     scene[0][:, 2] += torch.linspace(0.0, 0.6, 4000)
     scene[4] *= 0.05
     compare(scene, *camera(8, 7), 8, 7, t_min=0.0, alpha_min=1e-4, most_flips=0.5)
+
+
+@pytest.mark.parametrize("count", [5, 12, 70])
+def test_layers_at_one_depth_are_blended_by_rank(count):
+    """More than a sorting network takes, and more than the first queues hold, and only rank tells them apart."""
+    scene = random_billboards(23, count, 2, 2, torch.float32, 0.0, (0.5, 0.6))
+    scene[0][:, :2] = 0.05 * torch.randn(count, 2, generator=torch.Generator().manual_seed(2))
+    scene[1] = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4).clone()
+    scene[4] *= 0.1
+    compare(scene, *camera(20, 18), 20, 18)
+
+
+def test_a_picture_written_past_the_caches_is_the_same():
+    """Widths that are and are not multiples of eight pixels take different ways to memory."""
+    scene = random_billboards(24, 60, 4, 8)
+    view, K = camera(1024, 512, focal=500.0)
+    assert 1024 * 512 * 8 >= cpu_pixels.LARGE
+    image, opacity = render_billboards(*scene, view, K, 1024, 512)
+    other, other_opacity = render_billboards(*scene, view, K, 1021, 512)
+    assert float(opacity.max()) > 0.9
+    assert torch.equal(image[..., :1021], other)
+    assert torch.equal(opacity[..., :1021], other_opacity)
 
 
 def test_alpha_of_zero_and_one():
