@@ -35,7 +35,7 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 _SOURCES = (
     "binning.py", "compile.py", "cpu_blend.py", "cpu_gather.py", "cpu_groups.py", "cpu_hits.py", "cpu_pixels.py",
-    "cpu_projection.py", "cpu_queue.py", "lanes.py", "memory.py", "scalar.py", "sorting.py",
+    "cpu_projection_kernels.py", "cpu_queue.py", "lanes.py", "memory.py", "scalar.py", "sorting.py",
 )  # fmt: skip
 
 

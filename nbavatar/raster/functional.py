@@ -89,7 +89,7 @@ def render_billboards(
     _check_tensors(means, quats, half_extents, features, alpha, viewmat, K)
     _check_options(width, height, near, alpha_min, alpha_max, t_min, low_pass)
     queue = parse_order(order)
-    project, blend = _backend(backend, means, quats, half_extents)
+    project, blend = _backend(backend, means.device)
     settings = BlendSettings(width, height, queue, near, alpha_min, alpha_max, t_min, texture_support(alpha.shape[-1]))
     batched = viewmat.ndim == 3 or K.ndim == 3
     cameras = max(viewmat.shape[0] if viewmat.ndim == 3 else 1, K.shape[0] if K.ndim == 3 else 1)
@@ -107,9 +107,8 @@ def render_billboards(
     return torch.stack([image for image, _ in images]), torch.stack([opacity for _, opacity in images])
 
 
-def _backend(name: str, *poses: Tensor) -> tuple[_Project, _Blend]:
-    """Projection and blending for the device of the billboards' poses."""
-    device = poses[0].device
+def _backend(name: str, device: torch.device) -> tuple[_Project, _Blend]:
+    """Projection and blending on a device."""
     if name not in _BACKENDS:
         raise DataError.of(_WHERE, "backend", expected=f"one of {', '.join(_BACKENDS)}", found=repr(name))
     if name == "auto":
@@ -120,8 +119,7 @@ def _backend(name: str, *poses: Tensor) -> tuple[_Project, _Blend]:
         from nbavatar.raster.cpu import blend_cpu  # Numba is loaded only when it is needed
         from nbavatar.raster.cpu_projection import project_billboards_cpu
 
-        tracked = torch.is_grad_enabled() and any(pose.requires_grad for pose in poses)
-        return project_billboards if tracked else project_billboards_cpu, blend_cpu
+        return project_billboards_cpu, blend_cpu
     if name == "cuda" and (device.type == "cuda" or os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"):
         from nbavatar.raster.cuda import blend_cuda  # a machine without CUDA never gets here
 
