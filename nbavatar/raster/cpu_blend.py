@@ -75,7 +75,7 @@ def _wait(scene, k, replay, queue, found, groups, noted, level, capacity):
             _, closed = close(scene, k, first, through)
             finished += closed
         elif queue < 0:
-            full = full | (append(scene, k, key, group, first) > last)
+            full = full | (append(scene, k, j, group, first) > last)
         else:
             level = enqueue(scene, k, key, group, first, level)
             if level > queue:
@@ -168,6 +168,7 @@ def _build(replay):
                         put(k.sums, i, zero)
                 for i in range(plane):
                     put(k.count, i, 0)
+                    put(k.free, i, i)
                 if queue > 0:
                     for i in range(capacity * plane):
                         put(k.keys, i, none)

@@ -42,6 +42,7 @@ class Scratch(NamedTuple):
     floor: Any  # hits with a smaller key than this are of no use to the pixel
     sums: Any  # blended features, `stride` a pixel
     count: Any  # hits that wait
+    free: Any  # place of the first free slot
     last: Any  # replay: the hit blended last
     # queues of hits, `plane` a slot, LONGEST slots at least
     keys: Any
@@ -73,7 +74,7 @@ def scratch_sizes(rows: int, capacity: int, channels: int, groups: int, replay: 
     hits, slots = groups * LANES, max(capacity, LONGEST)
     features = LANES * stride + hits if replay else (hits + 1) * stride
     reals = plane * (2 + stride + 2 * slots) + hits + LANES + features + 5 * LANES * _GROUPS + LANES
-    wholes = plane * (1 + slots) + groups + 1 + (LANES + 3) * _GROUPS + 2 * TILE_HEIGHT + LANES
+    wholes = plane * (2 + slots) + groups + 1 + (LANES + 3) * _GROUPS + 2 * TILE_HEIGHT + LANES
     return reals, wholes + (hits + plane if replay else 0)
 
 
@@ -92,7 +93,7 @@ def divide(real, whole, plane, stride, capacity, groups, replay):
     row = weights + 4 * LANES * _GROUPS
     features = row + LANES
     worth = features + LANES * stride
-    ids = plane
+    ids = 2 * plane
     rank = ids + slots * plane
     cell = rank + groups + 1
     first = cell + LANES * _GROUPS
@@ -103,7 +104,8 @@ def divide(real, whole, plane, stride, capacity, groups, replay):
     if not replay:  # not used, and no room
         worth, last, before = 0, 0, 0
     return Scratch(
-        pointer(real, 0), pointer(real, floor), pointer(real, sums), pointer(whole, 0), pointer(whole, last),
+        pointer(real, 0), pointer(real, floor), pointer(real, sums),
+        pointer(whole, 0), pointer(whole, plane), pointer(whole, last),
         pointer(real, keys), pointer(real, opacities), pointer(whole, ids),
         pointer(real, opacity), pointer(real, features), pointer(real, worth), pointer(whole, before),
         pointer(whole, rank),

@@ -32,21 +32,23 @@ _sort_2, _sort_4, _sort_8, _sort_all = network(2), network(4), network(8), netwo
 
 
 @inlined
-def append(scene, k, key, group, first):
-    """Puts hits behind the queues of the pixels `first + lane`; returns how many hits wait there then.
+def append(scene, k, j, group, first):
+    """Puts the hits of group j of the billboard in hand behind the queues of the pixels `first + lane`.
 
     A lane without a hit is written as well, to a place that stays free.
+
+    Returns:
+        How many hits wait at each of the pixels then.
     """
-    count = load(k.count, first)
-    store(k.whole, 0, count * spread(np.int32(scene.plane)) + spread(np.int32(first)) + lane_numbers())
-    store(k.row, 0, key)
-    count = count + truths(key > scene.limits.none)
-    store(k.count, first, count)
     for lane in range(LANES):
-        at, number = np.int64(get(k.whole, lane)), group * LANES + lane
-        put(k.keys, at, get(k.row, lane))
+        at, number = np.int64(get(k.free, first + lane)), group * LANES + lane
+        put(k.keys, at, get(k.key, j * LANES + lane))
         put(k.opacities, at, get(k.opacity, number))
         put(k.ids, at, number)
+    hit = truths(load(k.key, j * LANES) > scene.limits.none)
+    count = load(k.count, first) + hit
+    store(k.count, first, count)
+    store(k.free, first, load(k.free, first) + hit * spread(np.int32(scene.plane)))
     return count
 
 
@@ -206,6 +208,7 @@ def drain(scene, k, replay, reach, pixels, noted):
         held = held - spread(np.int32(gone))
         held = choose(done, zero, choose(held > zero, held, zero))
         store(k.count, first, held)
+        store(k.free, first, held * spread(np.int32(scene.plane)) + (spread(np.int32(first)) + lane_numbers()))
         most = np.int64(largest(held))
         in_use = max(in_use, most)
         waiting += LANES * most
