@@ -230,33 +230,46 @@ def close(scene, k, first, through):
 
 
 @inlined
+def _columns(k, at, stride):
+    """Features of eight neighbouring pixels, channel by channel, from `at` on."""
+    return transpose((
+        load(k.sums, at), load(k.sums, at + stride), load(k.sums, at + 2 * stride), load(k.sums, at + 3 * stride),
+        load(k.sums, at + 4 * stride), load(k.sums, at + 5 * stride), load(k.sums, at + 6 * stride),
+        load(k.sums, at + 7 * stride),
+    ))  # fmt: skip
+
+
+@inlined
 def write(scene, k, image, opacity, left, right, top, bottom, width, height):
     """Writes a band's pixels into the results, which begin at multiples of 64 bytes."""
     one = scene.limits.one
     area, stride = np.int64(width) * height, scene.stride
-    # A large image is not in the caches when it is read: writing past them saves reading the memory first.
-    past = width % LANES == 0 and area * scene.channels >= LARGE
+    if width % (2 * LANES) == 0 and area * scene.channels >= LARGE:
+        # A large image is not in the caches when it is read: writing past them saves reading the memory first. The
+        # second half of a line follows the first at once: few lines can be under way.
+        for y in range(top, bottom):
+            for x in range(left, right, 2 * LANES):
+                first = (y - top) * TILE_WIDTH + x - left
+                pixel = np.int64(y) * width + x
+                stream(opacity, pixel, one - load(k.through, first))
+                stream(opacity, pixel + LANES, one - load(k.through, first + LANES))
+                for c in range(0, scene.channels, LANES):
+                    here = _columns(k, first * stride + c, stride)
+                    beside = _columns(k, (first + LANES) * stride + c, stride)
+                    for lane in range(min(LANES, scene.channels - c)):
+                        stream(image, (c + lane) * area + pixel, here[lane])
+                        stream(image, (c + lane) * area + pixel + LANES, beside[lane])
+        return
     for y in range(top, bottom):
         for x in range(left, right, LANES):
             used = first_lanes(right - x)
             first = (y - top) * TILE_WIDTH + x - left
             pixel = np.int64(y) * width + x
-            if past:
-                stream(opacity, pixel, one - load(k.through, first))
-            else:
-                store_where(opacity, pixel, one - load(k.through, first), used)
+            store_where(opacity, pixel, one - load(k.through, first), used)
             for c in range(0, scene.channels, LANES):
-                at = first * stride + c
-                columns = transpose((
-                    load(k.sums, at), load(k.sums, at + stride), load(k.sums, at + 2 * stride),
-                    load(k.sums, at + 3 * stride), load(k.sums, at + 4 * stride), load(k.sums, at + 5 * stride),
-                    load(k.sums, at + 6 * stride), load(k.sums, at + 7 * stride),
-                ))  # fmt: skip
+                columns = _columns(k, first * stride + c, stride)
                 for lane in range(min(LANES, scene.channels - c)):
-                    if past:
-                        stream(image, (c + lane) * area + pixel, columns[lane])
-                    else:
-                        store_where(image, (c + lane) * area + pixel, columns[lane], used)
+                    store_where(image, (c + lane) * area + pixel, columns[lane], used)
 
 
 @inlined

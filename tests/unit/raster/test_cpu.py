@@ -174,7 +174,7 @@ def test_layers_at_one_depth_are_blended_by_rank(count):
 
 
 def test_a_picture_written_past_the_caches_is_the_same():
-    """Widths that are and are not multiples of eight pixels take different ways to memory."""
+    """Widths that are and are not multiples of sixteen pixels take different ways to memory."""
     scene = random_billboards(24, 60, 4, 8)
     view, K = camera(1024, 512, focal=500.0)
     assert 1024 * 512 * 8 >= cpu_pixels.LARGE
