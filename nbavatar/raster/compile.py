@@ -26,12 +26,16 @@ from llvmlite import binding
 from numba import njit
 from numba.core import caching
 
-__all__ = ["FAST", "exact_kernel", "inlined", "keep_kernels", "kernel", "prepare", "run_workers"]
+__all__ = ["FAST", "exact_inlined", "exact_kernel", "inlined", "keep_kernels", "kernel", "prepare", "run_workers"]
 
 _LOG = logging.getLogger("nbavatar.raster")
 
 # Contraction and reassociation only: comparisons with NaN and infinity must keep their meaning.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
+
+_ABSORBED: dict[str, Any] = {
+    "nogil": True, "error_model": "numpy", "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
+}  # fmt: skip
 
 _SOURCES = (
     "binning.py", "compile.py", "cpu_blend.py", "cpu_gather.py", "cpu_groups.py", "cpu_hits.py", "cpu_pixels.py",
@@ -122,9 +126,12 @@ def exact_kernel(function: Callable[..., Any]) -> Any:
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compiles a function that its caller absorbs."""
-    return njit(
-        nogil=True, fastmath=FAST, error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
-    )(function)
+    return njit(fastmath=FAST, **_ABSORBED)(function)
+
+
+def exact_inlined(function: Callable[..., Any]) -> Any:
+    """Compiles a function that an exact kernel absorbs."""
+    return njit(**_ABSORBED)(function)
 
 
 @contextlib.contextmanager

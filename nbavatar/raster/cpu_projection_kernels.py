@@ -8,14 +8,14 @@ import math
 
 import numpy as np
 
-from nbavatar.raster.compile import exact_kernel
+from nbavatar.raster.compile import exact_inlined, exact_kernel
 from nbavatar.raster.projection import FADE_FLOOR
 
 __all__ = ["project", "project_back"]
 
 
-@exact_kernel
-def _place(i, means, quats, extents, view, intrinsics, c, au, av, g):
+@exact_inlined
+def _place(i, means, quats, extents, view, c, au, av, g):
     """Writes centre and axes in the camera's frame and the cross products; returns 1 / volume, 0 where seen edge-on."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     s = 2.0 / (w * w + x * x + y * y + z * z)
@@ -35,7 +35,7 @@ def _place(i, means, quats, extents, view, intrinsics, c, au, av, g):
     return 1.0 / volume if volume != 0.0 else 0.0
 
 
-@exact_kernel
+@exact_inlined
 def _row(g, row, inverse, intrinsics):
     """Row of the plane's matrix P, before the low-pass."""
     fx, skew, cx, fy, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
@@ -43,7 +43,7 @@ def _row(g, row, inverse, intrinsics):
     return x * inverse, y * inverse, (g[row, 2] - x * cx - y * cy) * inverse
 
 
-@exact_kernel
+@exact_inlined
 def _jacobian(au, av, dx, dy, z, intrinsics):
     """Derivative of the pixel by (u, v) at the centre, `(dx, dy)` from the principal point: ux, vx, uy, vy."""
     fx, skew, fy = intrinsics[0], intrinsics[1], intrinsics[3]
@@ -51,12 +51,84 @@ def _jacobian(au, av, dx, dy, z, intrinsics):
     return ux, vx, (fy * au[1] - dy * au[2]) / z, (fy * av[1] - dy * av[2]) / z
 
 
-@exact_kernel
+@exact_inlined
 def _spectrum(ux, vx, uy, vy):
     """|det|, sum and difference of the singular values: s1 s2, s1 + s2, s1 - s2."""
     plus = (ux + vy) * (ux + vy) + (uy - vx) * (uy - vx)
     minus = (ux - vy) * (ux - vy) + (uy + vx) * (uy + vx)
     return abs(ux * vy - vx * uy), math.sqrt(max(plus, minus)), math.sqrt(min(plus, minus))
+
+
+@exact_inlined
+def _low_pass(ux, vx, uy, vy, radius):
+    """Contraction of screen offsets xx, xy, yy, the fade, and whether there is any; see `projection._low_pass`."""
+    det, total, gap = _spectrum(ux, vx, uy, vy)
+    large = 0.5 * (total + gap)
+    if 0.0 < large < radius:
+        scale = 1.0 / (radius * total)
+        xx, xy = (ux * ux + vx * vx + det) * scale, (ux * uy + vx * vy) * scale
+        return xx, xy, (uy * uy + vy * vy + det) * scale, det / (radius * radius), True
+    if large > 0.0 and det / large < radius:
+        small = 2.0 * det / (total + gap)
+        factor = small / radius
+        slope = (1.0 - factor) / (total * gap)
+        shift = factor - slope * (small * small)
+        xx, xy = slope * (ux * ux + vx * vx) + shift, slope * (ux * uy + vx * vy)
+        return xx, xy, slope * (uy * uy + vy * vy) + shift, factor, True
+    return 1.0, 0.0, 1.0, 1.0, False
+
+
+@exact_inlined
+def _low_pass_back(ux, vx, uy, vy, radius, by_xx, by_xy, by_yy, by_fade):
+    """Gradients by the Jacobian from those by what `_low_pass` returns where it contracts."""
+    det, total, gap = _spectrum(ux, vx, uy, vy)
+    aa, ab, bb = ux * ux + vx * vx, ux * uy + vx * vy, uy * uy + vy * vy
+    if 0.5 * (total + gap) < radius:
+        scale = 1.0 / (radius * total)
+        by_det = (by_xx + by_yy) * scale + by_fade / (radius * radius)
+        by_scale = by_xx * (aa + det) + by_xy * ab + by_yy * (bb + det)
+        by_total, by_gap = -by_scale * scale / total, 0.0
+    else:
+        small = 2.0 * det / (total + gap)
+        factor = small / radius
+        scale = (1.0 - factor) / (total * gap)
+        by_shift = by_xx + by_yy
+        by_scale = by_xx * aa + by_xy * ab + by_yy * bb - by_shift * (small * small)
+        by_factor = by_fade + by_shift - by_scale / (total * gap)
+        by_small = by_factor / radius - 2.0 * by_shift * scale * small
+        by_det = 2.0 * by_small / (total + gap)
+        by_total = -by_scale * scale / total - by_small * small / (total + gap)
+        by_gap = -by_scale * scale / gap - by_small * small / (total + gap)
+    by_aa, by_ab, by_bb = by_xx * scale, by_xy * scale, by_yy * scale
+    turn = ux * vy - vx * uy  # a fourth of `plus - minus` in `_spectrum`
+    longer, shorter = by_total / total, by_gap / gap if gap > 0.0 else 0.0
+    plus = longer if turn > 0.0 else shorter if turn < 0.0 else 0.5 * (longer + shorter)
+    minus = longer + shorter - plus
+    by_turn = by_det if turn > 0.0 else -by_det if turn < 0.0 else 0.0
+    return (
+        2.0 * ux * by_aa + uy * by_ab + by_turn * vy + (ux + vy) * plus + (ux - vy) * minus,
+        2.0 * vx * by_aa + vy * by_ab - by_turn * uy - (uy - vx) * plus + (uy + vx) * minus,
+        2.0 * uy * by_bb + ux * by_ab - by_turn * vx + (uy - vx) * plus + (uy + vx) * minus,
+        2.0 * vy * by_bb + vx * by_ab + by_turn * ux + (ux + vy) * plus - (ux - vy) * minus,
+    )
+
+
+@exact_inlined
+def _axes_back(i, quats, extents, by_u, by_v, grad_quats, grad_extents):
+    """Gradients by quaternion and half-extents from those by the two half-axes in the world's frame."""
+    w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    u_0, u_1, u_2 = y * y + z * z, x * y + w * z, x * z - w * y
+    v_0, v_1, v_2 = x * y - w * z, x * x + z * z, y * z + w * x
+    grad_extents[i, 0] = by_u[0] * (1.0 - s * u_0) + by_u[1] * (s * u_1) + by_u[2] * (s * u_2)
+    grad_extents[i, 1] = by_v[0] * (s * v_0) + by_v[1] * (1.0 - s * v_1) + by_v[2] * (s * v_2)
+    a, b, c = by_u[0] * extents[i, 0], by_u[1] * extents[i, 0], by_u[2] * extents[i, 0]
+    d, e, f = by_v[0] * extents[i, 1], by_v[1] * extents[i, 1], by_v[2] * extents[i, 1]
+    by_s = s * (b * u_1 + c * u_2 - a * u_0 + d * v_0 + f * v_2 - e * v_1)  # s = 2 / |q|^2: its slope is -s^2 q
+    grad_quats[i, 0] = s * (b * z - c * y - d * z + f * x - by_s * w)
+    grad_quats[i, 1] = s * (b * y + c * z + d * y - 2.0 * e * x + f * w - by_s * x)
+    grad_quats[i, 2] = s * (b * x - 2.0 * a * y - c * w + d * x + f * z - by_s * y)
+    grad_quats[i, 3] = s * (b * w - 2.0 * a * z + c * x - d * w - 2.0 * e * z + f * y - by_s * z)
 
 
 @exact_kernel
@@ -73,7 +145,7 @@ def project(first, end, means, quats, extents, view, intrinsics, near, low_pass,
     fx, skew, cx, fy, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
     c, au, av, g, corners = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((4, 3))
     for i in range(first, end):
-        inverse = _place(i, means, quats, extents, view, intrinsics, c, au, av, g)
+        inverse = _place(i, means, quats, extents, view, c, au, av, g)
         facing = inverse != 0.0
         for row in range(3):
             plane[i, row, 0], plane[i, row, 1], plane[i, row, 2] = _row(g, row, inverse, intrinsics)
@@ -84,24 +156,8 @@ def project(first, end, means, quats, extents, view, intrinsics, near, low_pass,
         squeezed = False
         xx, xy, yy = 1.0, 0.0, 1.0
         if low_pass > 0.0 and in_front and facing:
-            ux, vx, uy, vy = _jacobian(au, av, x0 - cx, y0 - cy, z, intrinsics)
-            det, total, gap = _spectrum(ux, vx, uy, vy)
-            large = 0.5 * (total + gap)
-            if 0.0 < large < low_pass:
-                squeezed = True
-                scale = 1.0 / (low_pass * total)
-                xx, xy = (ux * ux + vx * vx + det) * scale, (ux * uy + vx * vy) * scale
-                yy = (uy * uy + vy * vy + det) * scale
-                fade[i] = det / (low_pass * low_pass)
-            elif large > 0.0 and det / large < low_pass:
-                squeezed = True
-                small = 2.0 * det / (total + gap)
-                factor = small / low_pass
-                slope = (1.0 - factor) / (total * gap)
-                shift = factor - slope * (small * small)
-                xx, xy = slope * (ux * ux + vx * vx) + shift, slope * (ux * uy + vx * vy)
-                yy = slope * (uy * uy + vy * vy) + shift
-                fade[i] = factor
+            jacobian = _jacobian(au, av, x0 - cx, y0 - cy, z, intrinsics)
+            xx, xy, yy, fade[i], squeezed = _low_pass(*jacobian, low_pass)
         if squeezed:
             dx, dy = x0 - (xx * x0 + xy * y0), y0 - (xy * x0 + yy * y0)
             for row in range(3):
@@ -158,70 +214,38 @@ def project_back(first, end, means, quats, extents, view, intrinsics, near, low_
         np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3),
     )  # fmt: skip
     for i in range(first, end):
-        inverse = _place(i, means, quats, extents, view, intrinsics, c, au, av, g)
+        inverse = _place(i, means, quats, extents, view, c, au, av, g)
         for j in range(3):
             by_c[j], by_au[j], by_av[j] = 0.0, 0.0, 0.0
         xx, xy, yy, dx, dy = 1.0, 0.0, 1.0, 0.0, 0.0
+        squeezed = False
         if low_pass > 0.0 and c[2] > near and inverse != 0.0:
             z = c[2]
             x0, y0 = (fx * c[0] + skew * c[1]) / z + cx, fy * c[1] / z + cy
             ux, vx, uy, vy = _jacobian(au, av, x0 - cx, y0 - cy, z, intrinsics)
-            det, total, gap = _spectrum(ux, vx, uy, vy)
-            large = 0.5 * (total + gap)
-            both = 0.0 < large < low_pass
-            if both or (large > 0.0 and det / large < low_pass):
-                # `middle` is what J J^T is multiplied by, `shift` what is added on the diagonal
-                small, factor = 2.0 * det / (total + gap), 2.0 * det / (total + gap) / low_pass
-                middle = 1.0 / (low_pass * total) if both else (1.0 - factor) / (total * gap)
-                shift = det * middle if both else factor - middle * (small * small)
-                aa, ab, bb = ux * ux + vx * vx, ux * uy + vx * vy, uy * uy + vy * vy
-                xx, xy, yy = middle * aa + shift, middle * ab, middle * bb + shift
-                dx, dy = x0 - (xx * x0 + xy * y0), y0 - (xy * x0 + yy * y0)
-                by_xx, by_xy, by_yy, by_dx, by_dy = 0.0, 0.0, 0.0, 0.0, 0.0
-                for row in range(3):
-                    a, b, _ = _row(g, row, inverse, intrinsics)
-                    p, q, r = grad_plane[i, row, 0], grad_plane[i, row, 1], grad_plane[i, row, 2]
-                    by_xx += p * a
-                    by_xy += p * b + q * a
-                    by_yy += q * b
-                    by_dx += r * a
-                    by_dy += r * b
-                by_x0, by_y0 = by_dx * (1.0 - xx) - by_dy * xy, by_dy * (1.0 - yy) - by_dx * xy
-                by_xx -= by_dx * x0
-                by_xy -= by_dx * y0 + by_dy * x0
-                by_yy -= by_dy * y0
-                by_aa, by_ab, by_bb = by_xx * middle, by_xy * middle, by_yy * middle
-                by_middle, by_shift = by_xx * aa + by_xy * ab + by_yy * bb, by_xx + by_yy
-                if both:
-                    by_middle += by_shift * det
-                    by_det = by_shift * middle + grad_fade[i] / (low_pass * low_pass)
-                    by_total, by_gap = -by_middle * middle / total, 0.0
-                else:
-                    by_middle -= by_shift * (small * small)
-                    by_factor = grad_fade[i] + by_shift - by_middle / (total * gap)
-                    by_small = by_factor / low_pass - 2.0 * by_shift * middle * small
-                    by_det = 2.0 * by_small / (total + gap)
-                    by_total = -by_middle * middle / total - by_small * small / (total + gap)
-                    by_gap = -by_middle * middle / gap - by_small * small / (total + gap)
-                turn = (
-                    ux * vy - vx * uy
-                )  # which of the two squares in `_spectrum` is the larger: their difference is 4 det
-                longer, shorter = by_total / total, by_gap / gap if gap > 0.0 else 0.0
-                plus = longer if turn > 0.0 else shorter if turn < 0.0 else 0.5 * (longer + shorter)
-                minus = longer + shorter - plus
-                by_det = by_det if turn > 0.0 else -by_det if turn < 0.0 else 0.0
-                by_ux = 2.0 * ux * by_aa + uy * by_ab + by_det * vy + (ux + vy) * plus + (ux - vy) * minus
-                by_vx = 2.0 * vx * by_aa + vy * by_ab - by_det * uy - (uy - vx) * plus + (uy + vx) * minus
-                by_uy = 2.0 * uy * by_bb + ux * by_ab - by_det * vx + (uy - vx) * plus + (uy + vx) * minus
-                by_vy = 2.0 * vy * by_bb + vx * by_ab + by_det * ux + (ux + vy) * plus - (ux - vy) * minus
-                by_x0 -= (by_ux * au[2] + by_vx * av[2]) / z
-                by_y0 -= (by_uy * au[2] + by_vy * av[2]) / z
-                ox, oy = x0 - cx, y0 - cy
-                by_au[0], by_av[0] = by_ux * fx / z, by_vx * fx / z
-                by_au[1], by_av[1] = (by_ux * skew + by_uy * fy) / z, (by_vx * skew + by_vy * fy) / z
-                by_au[2], by_av[2] = -(by_ux * ox + by_uy * oy) / z, -(by_vx * ox + by_vy * oy) / z
-                by_c[0], by_c[1] = by_x0 * fx / z, (by_x0 * skew + by_y0 * fy) / z
-                by_c[2] = -(by_x0 * ox + by_y0 * oy + by_ux * ux + by_vx * vx + by_uy * uy + by_vy * vy) / z
+            xx, xy, yy, _, squeezed = _low_pass(ux, vx, uy, vy, low_pass)
+        if squeezed:
+            dx, dy = x0 - (xx * x0 + xy * y0), y0 - (xy * x0 + yy * y0)
+            by_xx, by_xy, by_yy, by_dx, by_dy = 0.0, 0.0, 0.0, 0.0, 0.0
+            for row in range(3):
+                a, b, _ = _row(g, row, inverse, intrinsics)
+                p, q, r = grad_plane[i, row, 0], grad_plane[i, row, 1], grad_plane[i, row, 2]
+                by_xx += p * a
+                by_xy += p * b + q * a
+                by_yy += q * b
+                by_dx += r * a
+                by_dy += r * b
+            by_xx, by_xy, by_yy = by_xx - by_dx * x0, by_xy - by_dx * y0 - by_dy * x0, by_yy - by_dy * y0
+            by_x0, by_y0 = by_dx * (1.0 - xx) - by_dy * xy, by_dy * (1.0 - yy) - by_dx * xy
+            by_ux, by_vx, by_uy, by_vy = _low_pass_back(ux, vx, uy, vy, low_pass, by_xx, by_xy, by_yy, grad_fade[i])
+            by_x0 -= (by_ux * au[2] + by_vx * av[2]) / z
+            by_y0 -= (by_uy * au[2] + by_vy * av[2]) / z
+            ox, oy = x0 - cx, y0 - cy
+            by_au[0], by_av[0] = by_ux * fx / z, by_vx * fx / z
+            by_au[1], by_av[1] = (by_ux * skew + by_uy * fy) / z, (by_vx * skew + by_vy * fy) / z
+            by_au[2], by_av[2] = -(by_ux * ox + by_uy * oy) / z, -(by_vx * ox + by_vy * oy) / z
+            by_c[0], by_c[1] = by_x0 * fx / z, (by_x0 * skew + by_y0 * fy) / z
+            by_c[2] = -(by_x0 * ox + by_y0 * oy + by_ux * ux + by_vx * vx + by_uy * uy + by_vy * vy) / z
         for row in range(3):
             p, q, r = grad_plane[i, row, 0], grad_plane[i, row, 1], grad_plane[i, row, 2]
             x = (p * xx + q * xy + r * dx - r * cx) * inverse
@@ -237,19 +261,4 @@ def project_back(first, end, means, quats, extents, view, intrinsics, near, low_
             grad_means[i, j] = a * by_c[0] + b * by_c[1] + d * by_c[2]
             by_u[j] = a * by_au[0] + b * by_au[1] + d * by_au[2]
             by_v[j] = a * by_av[0] + b * by_av[1] + d * by_av[2]
-        w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
-        s = 2.0 / (w * w + x * x + y * y + z * z)
-        yz, wz, wy = y * y + z * z, x * y + w * z, x * z - w * y
-        zw, xz, wx = x * y - w * z, x * x + z * z, y * z + w * x
-        grad_extents[i, 0] = by_u[0] * (1.0 - s * yz) + by_u[1] * (s * wz) + by_u[2] * (s * wy)
-        grad_extents[i, 1] = by_v[0] * (s * zw) + by_v[1] * (1.0 - s * xz) + by_v[2] * (s * wx)
-        for j in range(3):
-            by_u[j], by_v[j] = by_u[j] * extents[i, 0], by_v[j] * extents[i, 1]
-        by_s = by_u[1] * wz + by_u[2] * wy - by_u[0] * yz + by_v[0] * zw + by_v[2] * wx - by_v[1] * xz
-        by_s *= s  # s = 2 / |q|^2, whose derivative is -s^2 q
-        grad_quats[i, 0] = s * (by_u[1] * z - by_u[2] * y - by_v[0] * z + by_v[2] * x - by_s * w)
-        grad_quats[i, 1] = s * (by_u[1] * y + by_u[2] * z + by_v[0] * y - 2.0 * by_v[1] * x + by_v[2] * w - by_s * x)
-        grad_quats[i, 2] = s * (by_u[1] * x - 2.0 * by_u[0] * y - by_u[2] * w + by_v[0] * x + by_v[2] * z - by_s * y)
-        grad_quats[i, 3] = s * (
-            by_u[1] * w - 2.0 * by_u[0] * z + by_u[2] * x - by_v[0] * w - 2.0 * by_v[1] * z + by_v[2] * y - by_s * z
-        )
+        _axes_back(i, quats, extents, by_u, by_v, grad_quats, grad_extents)
