@@ -42,7 +42,7 @@ class Scratch(NamedTuple):
     floor: Any  # hits with a smaller key than this are of no use to the pixel
     sums: Any  # blended features, `stride` a pixel
     count: Any  # hits that wait
-    free: Any  # place of the first free slot
+    free: Any  # place of the first free slot; follows from `count`, but is read lane by lane
     last: Any  # replay: the hit blended last
     # queues of hits, `plane` a slot, LONGEST slots at least
     keys: Any

@@ -24,11 +24,12 @@ from nbavatar.raster.lanes import (
     truths,
 )  # fmt: skip
 from nbavatar.raster.memory import get, put
-from nbavatar.raster.sorting import LONGEST, network
+from nbavatar.raster.sorting import LONGEST, merge_exchange, network
 
 __all__ = ["append", "drain", "enqueue", "pop"]
 
 _sort_2, _sort_4, _sort_8, _sort_all = network(2), network(4), network(8), network(LONGEST)
+_sort_any = inlined(merge_exchange)
 
 
 @inlined
@@ -100,8 +101,10 @@ def pop(scene, k, replay, first, full, level, noted):
 
 
 @inlined
-def _exchange(scene, k, a, b):
-    """Brings the hits at two places of the same queues in order: by key, equal ones by rank."""
+def _exchange(queues, i, j):
+    """Brings slots i and j of the same queues in order: by key, equal ones by rank."""
+    scene, k, first = queues
+    a, b = i * scene.plane + first, j * scene.plane + first
     key, other = load(k.keys, a), load(k.keys, b)
     number, other_number = load(k.ids, a), load(k.ids, b)
     opacity, other_opacity = load(k.opacities, a), load(k.opacities, b)
@@ -115,25 +118,6 @@ def _exchange(scene, k, a, b):
     store(k.ids, b, choose(behind, number, other_number))
     store(k.opacities, a, choose(behind, other_opacity, opacity))
     store(k.opacities, b, choose(behind, opacity, other_opacity))
-
-
-@inlined
-def _sort_any(scene, k, first, most):
-    """Sorts `most` slots of the queues `first + lane` by the comparisons of `sorting.comparisons`, one by one."""
-    top = 1
-    while 2 * top < most:
-        top *= 2
-    p = top
-    while p > 0:
-        q, r, d = top, 0, p
-        while True:
-            for i in range(most - d):
-                if i & p == r:
-                    _exchange(scene, k, i * scene.plane + first, (i + d) * scene.plane + first)
-            if q == p:
-                break
-            q, r, d = q // 2, p, q - p
-        p //= 2
 
 
 @inlined
@@ -154,7 +138,7 @@ def _sort(scene, k, first, count, most):
             at = slot * plane + first
             store(k.keys, at, choose(count > spread(np.int32(slot)), load(k.keys, at), none))
     if most > LONGEST or any_lane(tied):
-        _sort_any(scene, k, first, most)
+        _sort_any(most, _exchange, (scene, k, first))
 
 
 @inlined

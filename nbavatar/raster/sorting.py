@@ -8,26 +8,36 @@ from numba.extending import intrinsic
 
 from nbavatar.raster.lanes import LANES, Lanes
 
-__all__ = ["LONGEST", "comparisons", "network"]
+__all__ = ["LONGEST", "comparisons", "merge_exchange", "network"]
 
 LONGEST = 16  # slots that a network sorts: three numbers of each are held at once
 
 
-def comparisons(count: int) -> list[tuple[int, int]]:
-    """Pairs of places to compare and exchange, in order, so that `count` numbers are sorted.
+def merge_exchange(count, exchange, context):
+    """Calls `exchange(context, i, j)` for the pairs of places to compare, in order, so that `count` items get sorted.
 
-    Batcher's merge exchange (Knuth, The Art of Computer Programming 3, 5.2.2, algorithm M).
+    Batcher's method (Knuth, The Art of Computer Programming 3, 5.2.2, algorithm M). Plain enough for kernels as well.
     """
-    pairs = []
-    top = p = 1 << max(count - 1, 0).bit_length() >> 1
+    top = 1
+    while 2 * top < count:
+        top *= 2
+    p = top
     while p > 0:
         q, r, d = top, 0, p
         while True:
-            pairs += [(i, i + d) for i in range(count - d) if i & p == r]
+            for i in range(count - d):
+                if i & p == r:
+                    exchange(context, i, i + d)
             if q == p:
                 break
             q, r, d = q // 2, p, q - p
         p //= 2
+
+
+def comparisons(count: int) -> list[tuple[int, int]]:
+    """The pairs of places that `merge_exchange` compares."""
+    pairs: list[tuple[int, int]] = []
+    merge_exchange(count, lambda found, i, j: found.append((i, j)), pairs)
     return pairs
 
 
