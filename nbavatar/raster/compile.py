@@ -39,7 +39,7 @@ _ABSORBED: dict[str, Any] = {
 
 _SOURCES = (
     "binning.py", "compile.py", "cpu_blend.py", "cpu_gather.py", "cpu_groups.py", "cpu_hits.py", "cpu_pixels.py",
-    "cpu_projection_kernels.py", "cpu_queue.py", "lanes.py", "memory.py", "scalar.py", "sorting.py",
+    "cpu_projection_kernels.py", "cpu_queue.py", "cpu_scratch.py", "lanes.py", "memory.py", "scalar.py", "sorting.py",
 )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import torch
 from numba import types
 from torch import Tensor
 
-from nbavatar.raster import binning, cpu_blend, cpu_gather, cpu_pixels, workspace
+from nbavatar.raster import binning, cpu_blend, cpu_gather, cpu_scratch, workspace
 from nbavatar.raster.binning import bin_billboards, require_memory
 from nbavatar.raster.compile import prepare, run_workers
 from nbavatar.raster.cpu_hits import write_limits
@@ -22,7 +22,7 @@ from nbavatar.raster.reference import BlendSettings
 __all__ = ["blend_cpu", "count_samples"]
 
 _QUEUE = 64  # hits that may wait at a pixel; where half of them have to stay, a tile is done again with room for all
-_NOTES = 1 << 23  # groups of hits noted at once in the backward pass: 576 MiB in float32
+_NOTES = 6 << 20  # bundles of hits noted at once in the backward pass: 576 MiB in float32
 _SCRATCH = 1 << 26  # bytes that a worker may use; fewer rows are worked on at once beyond it
 
 
@@ -76,7 +76,7 @@ class _Pass:
     tiles: np.ndarray
     capacity: int
     rows: int
-    groups: int
+    bundles: int
 
 
 class _Scene:
@@ -124,7 +124,7 @@ class _Scene:
                 _complain(broken - 1)
             self.samples += sum(int(state[2]) for state in states)
             again = np.sort(np.concatenate([state[3 : 3 + state[0]] for state in states])).astype(np.int32)
-            self.passes.append(_Pass(np.setdiff1d(tiles, again), plan.capacity, plan.rows, plan.groups))
+            self.passes.append(_Pass(np.setdiff1d(tiles, again), plan.capacity, plan.rows, plan.bundles))
             tiles = again
             capacity = int(self.lengths[tiles].max(initial=1))
         return image, opacity
@@ -160,31 +160,35 @@ class _Scene:
     def _replay(self, grads: np.ndarray, covers: np.ndarray, outputs: tuple[np.ndarray, ...]) -> None:
         """Repeats the blending, range of tiles by range of tiles, and fills the gradients `outputs`."""
         b = self.bins
-        first_group = np.concatenate([[0], np.cumsum(self.made[:-1])])
-        parts = _divide(first_group)
-        largest = max((int(first_group[end] - first_group[first]) for first, end in parts), default=0)
+        first_bundle = np.concatenate([[0], np.cumsum(self.made[:-1])])
+        parts = _divide(first_bundle)
+        largest = max((int(first_bundle[end] - first_bundle[first]) for first, end in parts), default=0)
         bands = max((-(-binning.TILE_HEIGHT // plan.rows) for plan in self.passes), default=1)
         entries = len(b.members)
         require_memory(
-            largest * (2 * LANES * self.limits.itemsize + 8) + bands * entries * 8,
+            largest * LANES * (2 * self.limits.itemsize + 4) + bands * entries * 8,
             f"the notes of {largest * LANES} hits in the backward pass",
         )
         notes = workspace.empty((2 * LANES * largest,), self.limits.dtype)
-        spots = workspace.empty((2 * largest,), np.dtype(np.int32))
+        spots = workspace.empty((LANES * largest,), np.dtype(np.int32))
         nothing = np.zeros(0, self.limits.dtype)
-        shape = np.array([self.texels, self.channels, self.settings.width], np.int64)
+        shape = np.array([self.texels, self.channels, self.settings.width, self.across], np.int64)
         for number, (first, end) in enumerate(parts):
             ranges = np.zeros(2 * bands * entries, np.int32)
-            base = int(first_group[first])
+            base = int(first_bundle[first])
             for plan in self.passes:
                 chosen = plan.tiles[(plan.tiles >= first) & (plan.tiles < end)]
-                part = _Pass(chosen, plan.capacity, plan.rows, plan.groups)
-                self._run(part, True, nothing, nothing, grads, covers, notes, spots, ranges, base, first_group)
+                part = _Pass(chosen, plan.capacity, plan.rows, plan.bundles)
+                states = self._run(
+                    part, True, nothing, nothing, grads, covers, notes, spots, ranges, base, first_bundle
+                )
+                if any(state[0] for state in states):
+                    raise RuntimeError("render_billboards: the backward pass finds other hits than the forward pass")
             turn = np.zeros(1, np.int64)
 
             def work(_: int, first=first, end=end, base=base, fresh=number == 0, turn=turn, ranges=ranges) -> None:
                 cpu_gather.gather_gradients(
-                    turn, 16, first, end, bands, b.sequence, b.first, b.tile, b.where, ranges, first_group, notes,
+                    turn, 16, first, end, bands, b.sequence, b.first, b.tile, b.where, ranges, first_bundle, notes,
                     spots, base, b.record.reshape(-1), b.box, self.features, self.alpha, self.limits, shape, grads,
                     fresh, *outputs,
                     torch.empty(cpu_gather.scratch_size(self.texels, self.channels), dtype=self.dtype).numpy(),
@@ -198,13 +202,13 @@ class _Scene:
         most = int(self.bins.room[tiles].max(initial=0))
         rows = binning.TILE_HEIGHT
         while True:
-            groups = min(most, longest * rows * (binning.TILE_WIDTH // LANES))
-            if rows == 1 or self._bytes(rows, capacity, groups) <= _SCRATCH:
-                return _Pass(tiles, capacity, rows, groups)
+            bundles = min(most, longest * rows * (binning.TILE_WIDTH // LANES))
+            if rows == 1 or self._bytes(rows, capacity, bundles) <= _SCRATCH:
+                return _Pass(tiles, capacity, rows, bundles)
             rows //= 2
 
-    def _bytes(self, rows: int, capacity: int, groups: int) -> int:
-        reals, wholes = cpu_pixels.scratch_sizes(rows, capacity, self.channels, groups, True)
+    def _bytes(self, rows: int, capacity: int, bundles: int) -> int:
+        reals, wholes = cpu_scratch.scratch_sizes(rows, capacity, self.channels, bundles, True)
         return reals * self.limits.itemsize + wholes * 4
 
     def _run(
@@ -215,11 +219,11 @@ class _Scene:
         s, b = self.settings, self.bins
         workers = torch.get_num_threads()
         require_memory(
-            workers * self._bytes(plan.rows, plan.capacity, plan.groups), f"queues of {plan.capacity} hits a pixel"
+            workers * self._bytes(plan.rows, plan.capacity, plan.bundles), f"queues of {plan.capacity} hits a pixel"
         )
-        reals, wholes = cpu_pixels.scratch_sizes(plan.rows, plan.capacity, self.channels, plan.groups, replay)
+        reals, wholes = cpu_scratch.scratch_sizes(plan.rows, plan.capacity, self.channels, plan.bundles, replay)
         values = [
-            self.texels, self.channels, s.width, s.height, self.across, s.queue, plan.capacity, plan.rows, plan.groups,
+            self.texels, self.channels, s.width, s.height, self.across, s.queue, plan.capacity, plan.rows, plan.bundles,
         ]  # fmt: skip
         shape = np.array(values, np.int64)
         turn = np.zeros(1, np.int64)
@@ -237,14 +241,14 @@ class _Scene:
         return run_workers(work)
 
 
-def _divide(first_group: np.ndarray) -> list[tuple[int, int]]:
+def _divide(first_bundle: np.ndarray) -> list[tuple[int, int]]:
     """Consecutive tiles whose hits can be noted together."""
     parts, first = [], 0
-    for tile in range(1, len(first_group)):
-        if tile > first and first_group[tile] - first_group[first] > _NOTES and tile - first > 1:
+    for tile in range(1, len(first_bundle)):
+        if tile > first and first_bundle[tile] - first_bundle[first] > _NOTES and tile - first > 1:
             parts.append((first, tile - 1))
             first = tile - 1
-    parts.append((first, len(first_group) - 1))
+    parts.append((first, len(first_bundle) - 1))
     return parts
 
 

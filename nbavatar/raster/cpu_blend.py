@@ -13,11 +13,12 @@ import numpy as np
 
 from nbavatar.raster.binning import RECORD, TILE_WIDTH, tile_bounds
 from nbavatar.raster.compile import inlined, kernel
-from nbavatar.raster.cpu_groups import COLUMN, ROW, list_groups, locate, sample
-from nbavatar.raster.cpu_hits import INFINITE, LOWEST, NONE, ONE, SIZE, ZERO, patch_of, read_limits, spans
-from nbavatar.raster.cpu_pixels import Scene, blend, close, divide, evaluate, keep_worth, settle, write
-from nbavatar.raster.cpu_queue import append, drain, enqueue, pop
-from nbavatar.raster.lanes import LANES, any_lane, choose, first_lanes, lane_numbers, load, spread, store
+from nbavatar.raster.cpu_groups import evaluate, list_groups, list_hits, locate
+from nbavatar.raster.cpu_hits import read_limits, spread_limits
+from nbavatar.raster.cpu_pixels import blend_at_once, keep_worth, settle, write
+from nbavatar.raster.cpu_queue import append, drain, pass_through
+from nbavatar.raster.cpu_scratch import ROW, Layout, Scene, divide
+from nbavatar.raster.lanes import LANES, load, spread, store
 from nbavatar.raster.memory import ahead, fetch_add, get, pointer, prefetch, put
 from nbavatar.raster.sorting import LONGEST
 
@@ -28,63 +29,18 @@ _AHEAD = 512  # texels of the next billboard's opacity that are asked for in adv
 
 
 @inlined
-def _interpolate(scene, k, replay, texture, found, groups, noted, left, top, width, spots):
-    """Evaluates the features of a billboard's groups with a hit; the replay also notes where the groups are.
+def _note_spots(scene, k, hits, bundle, rows_above, spots):
+    """Writes where the hits of the billboard in hand are, bundle by bundle, and that none is blended yet: replay.
 
     Args:
-        texture: number of the billboard's first feature.
-        found: groups with a hit, in `order`; groups: that the band had before.
-        noted: place of the band's first group among the notes.
+        bundle: number of the first among the notes; rows_above: of the tile, over the band.
     """
-    features, nothing = ahead(scene.features, texture), scene.limits.zero
-    for m in range(found):
-        j, group = np.int64(get(k.order, m)), groups + m
-        if replay:
-            first = np.int64(get(k.first, j))
-            x, y = left + (first & COLUMN), top + (first >> ROW)
-            evaluate(scene, k, features, j, k.features)
-            keep_worth(scene, k, j, group, y * width + x)
-            at = noted + group
-            store(scene.notes, 2 * LANES * at, nothing)
-            store(scene.notes, 2 * LANES * at + LANES, nothing)
-            put(spots, 2 * at, x)
-            put(spots, 2 * at + 1, y)
-        else:
-            evaluate(scene, k, features, j, ahead(k.features, group * LANES * scene.stride))
-
-
-@inlined
-def _wait(scene, k, replay, queue, found, groups, noted, level, capacity):
-    """Has the hits found wait for their turn, or blends them where the order is the billboards'.
-
-    Returns:
-        Slots of the queues in use, or as many as there are if one is full, and pixels that this has finished.
-    """
-    one, none, finished = scene.limits.one, scene.limits.none, 0
-    last, full = spread(np.int32(capacity - 1)), first_lanes(0)
-    for m in range(found):
-        j, group = np.int64(get(k.order, m)), groups + m
-        first, key = np.int64(get(k.first, j)), load(k.key, j * LANES)
-        if queue == 0:
-            hit = key > none
-            through, opaque = load(k.through, first), load(k.opacity, group * LANES)
-            ids = spread(np.int32(group * LANES)) + lane_numbers()
-            blend(scene, k, replay, hit, first, through, through * opaque, ids, noted)
-            through = choose(hit, through * (one - opaque), through)
-            store(k.through, first, through)
-            _, closed = close(scene, k, first, through)
-            finished += closed
-        elif queue < 0:
-            full = full | (append(scene, k, j, group, first) > last)
-        else:
-            level = enqueue(scene, k, key, group, first, level)
-            if level > queue:
-                over = load(k.keys, queue * scene.plane + first) > none
-                if any_lane(over):
-                    finished += pop(scene, k, replay, first, over, level, noted)
-    if queue < 0 and found > 0:
-        level = capacity if any_lane(full) else max(level, 1)
-    return level, finished
+    nothing, down = scene.limits.zero, spread(np.int32(rows_above << ROW))
+    for h in range(0, hits, LANES):
+        at = 2 * (bundle * LANES + h)
+        store(scene.notes, at, nothing)
+        store(scene.notes, at + LANES, nothing)
+        store(spots, bundle * LANES + h, load(k.groups.spot, h) + down)
 
 
 def _build(replay):
@@ -105,18 +61,19 @@ def _build(replay):
             features, alpha: textures, flat.
             limits: see `cpu_hits`.
             shape: texels, channels, width, height, tiles across, queue, capacity of a queue, rows worked on at
-                once, groups that there is room for.
+                once, bundles that there is room for.
             image, opacity: (C, H, W), (H, W) results, flat; not written in the replay.
             grads: (H, W, stride) flat, gradients of the image, filled up with zeros; grad_opacity: (H, W) flat. These
                 and what follows are used in the replay.
-            notes: per group of hits, T a and then the gradient by a of the LANES hits; 0 where there is none.
-            spots: per group, x of the first pixel and y.
-            ranges: per band and tile entry, first and end of its groups, from those of the tile on.
-            made: (tiles + 1,) int64; groups made in each tile, written by the forward pass; in the replay their
+            notes: per bundle of hits, T a and then the gradient by a of the LANES hits; 0 where there is none.
+            spots: per bundle, the pixels' places in the tile.
+            ranges: per band and tile entry, first and end of its bundles, from those of the tile on.
+            made: (tiles + 1,) int64; bundles made in each tile, written by the forward pass; in the replay their
                 running number, the tile's first.
-            base: number of the first of the groups in `notes`.
+            base: number of the first of the bundles in `notes`.
             real, whole: scratch of this worker; see `scratch_sizes`.
-            status: [number of tiles given up, billboard with a NaN alpha + 1, hits, tiles given up ...].
+            status: [number of tiles given up, billboard with a NaN alpha + 1, hits, tiles given up ...]. The forward
+                pass gives up a tile whose queues are too short, the replay one that differs from what was made.
         """
         texels, channels, width, height, across, queue, capacity, rows, room = (
             shape[0], shape[1], shape[2], shape[3], shape[4], shape[5], shape[6], shape[7], shape[8],
@@ -125,18 +82,18 @@ def _build(replay):
         alpha, limits = pointer(alpha_, 0), pointer(limits_, 0)
         image, opacity = pointer(image_, 0), pointer(opacity_, 0)
         notes, spots, ranges = pointer(notes_, 0), pointer(spots_, 0), pointer(ranges_, 0)
-        zero, one, none = get(limits, ZERO), get(limits, ONE), get(limits, NONE)
+        numbers = read_limits(limits)
+        zero, one = numbers.zero, numbers.one
         stride = (channels + LANES - 1) // LANES * LANES
         plane = TILE_WIDTH * rows + LANES
         k = divide(real, whole, plane, stride, capacity, room, replay)
-        step = min(1, texels - 1)
         scene = Scene(
-            pointer(features_, 0), read_limits(limits), zero, step * channels, step * texels * channels,
-            step * (texels + 1) * channels, channels, stride, plane, room * LANES,
-            pointer(grads_, 0), pointer(grad_opacity_, 0), notes, pointer(status, 0),
+            pointer(features_, 0), Layout(texels, min(1, texels - 1), channels, stride), numbers,
+            spread_limits(numbers), room * LANES, pointer(grads_, 0), pointer(grad_opacity_, 0), notes,
+            pointer(status, 0),
         )  # fmt: skip
         for i in range(max(capacity, LONGEST) * plane):  # a free place's number is looked up as well
-            put(k.ids, i, 0)
+            put(k.queues.ids, i, 0)
         if not replay:
             for i in range(stride):
                 put(k.features, room * LANES * stride + i, zero)
@@ -148,18 +105,18 @@ def _build(replay):
             left, tile_top, right, tile_bottom = tile_bounds(tile, across, width, height)
             first_entry, end_entry = start[tile], start[tile + 1]
             noted = made[tile] - base if replay else 0
-            total_groups, hits_before = 0, status[2]
+            total, hits_before = 0, status[2]
             overflow = False
             for top in range(tile_top, tile_bottom, rows):
                 bottom = min(top + rows, tile_bottom)
                 pixels = TILE_WIDTH * (bottom - top)
                 for i in range(plane):  # pixels off the image count as finished
                     put(k.through, i, zero)
-                    put(k.floor, i, get(limits, INFINITE))
+                    put(k.floor, i, numbers.infinite)
                 for y in range(bottom - top):
                     for x in range(right - left):
                         put(k.through, y * TILE_WIDTH + x, one)
-                        put(k.floor, y * TILE_WIDTH + x, none)
+                        put(k.floor, y * TILE_WIDTH + x, numbers.none)
                 if replay:
                     for i in range(plane):
                         put(k.last, i, -1)
@@ -167,24 +124,17 @@ def _build(replay):
                     for i in range(pixels * stride):
                         put(k.sums, i, zero)
                 for i in range(plane):
-                    put(k.count, i, 0)
-                    put(k.free, i, i)
-                if queue > 0:
-                    for i in range(capacity * plane):
-                        put(k.keys, i, none)
+                    put(k.queues.count, i, 0)
                 active = (bottom - top) * (right - left)
-                level, groups, waiting, patience = 0, 0, 0, _PATIENCE
+                level, bundles, waiting, patience = 0, 0, 0, _PATIENCE
                 for entry in range(first_entry, end_entry + 1):
                     final = entry == end_entry
                     i = 0
-                    reach = get(limits, LOWEST)
+                    reach = numbers.lowest
                     if not final:
                         i = get(members, entry)
                         reach = get(record, i * RECORD + 11)
                     if level > 0 and (final or (queue < 0 and (level == capacity or waiting >= patience))):
-                        if queue > 0:
-                            for i in range(plane):
-                                put(k.count, i, level)
                         full = level == capacity
                         level, stay, finished = drain(scene, k, replay, reach, pixels, noted)
                         active -= finished
@@ -193,41 +143,51 @@ def _build(replay):
                         overflow = full and 2 * level > capacity and not final
                     if final or overflow or active == 0:
                         break
-                    first_group = groups
-                    x_first, x_end = max(left, box[i, 0]), min(right, box[i, 2])
-                    y_first, y_end = max(top, box[i, 1]), min(bottom, box[i, 3])
+                    x_first, x_end = max(left, box[i, 0]) - left, min(right, box[i, 2]) - left
+                    y_first, y_end = max(top, box[i, 1]) - top, min(bottom, box[i, 3]) - top
                     if y_first >= y_end:
                         continue
-                    r = i * RECORD
                     if entry + 1 < end_entry:  # the next billboard's opacities come while this one is worked on
                         for j in range(0, min(texels * texels, _AHEAD), 64 // alpha_.itemsize):
                             prefetch(alpha, np.int64(get(members, entry + 1)) * texels * texels + j)
-                    x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
-                    patch = patch_of(record, r)
-                    texture = np.int64(i) * texels * texels
-                    spans(record, r, get(limits, SIZE), one, x_first, x_end, x_origin, y_first, y_end, y_origin, k.ends)
-                    count = list_groups(k, left, top, y_first, y_end, spread(reach))
-                    locate(scene, k, patch, count, texture, x_origin - left, y_origin - top, spread(reach), texels)
-                    found, hits, broken = sample(
-                        scene, k, ahead(alpha, texture), patch.fade, count, groups, get(rank, i), step, step * texels
-                    )
+                    x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2 - left, (box[i, 1] + box[i, 3]) // 2 - top
+                    texture, mine = np.int64(i) * texels * texels, ahead(record, i * RECORD)
+                    features = ahead(scene.features, texture * channels)
+                    count = list_groups(scene, k, mine, x_first, x_end, x_origin, y_first, y_end, y_origin, reach)
+                    locate(scene, k, mine, features, count, x_origin, y_origin, reach)
+                    hits, broken = list_hits(scene, k, mine, ahead(alpha, texture), count)
                     if broken:
                         status[1] = i + 1
-                    waiting += hits
-                    _interpolate(scene, k, replay, texture * channels, found, groups, noted, left, top, width, spots)
-                    level, finished = _wait(scene, k, replay, queue, found, groups, noted, level, capacity)
-                    active -= finished
-                    groups += found
+                    more = (hits + LANES - 1) // LANES
+                    if replay and noted + bundles + more > made[tile + 1] - base:  # there is no room for them
+                        overflow = True
+                        break
+                    for bundle in range(bundles, bundles + more):
+                        put(k.rank, bundle, get(rank, i))
                     if replay:
+                        evaluate(scene, k, features, more * LANES, k.features)
+                        keep_worth(scene, k, hits, bundles, left, top, width)
+                        _note_spots(scene, k, hits, noted + bundles, top - tile_top, spots)
                         at = 2 * ((top - tile_top) // rows * len(members_) + entry)
-                        put(ranges, at, first_group + total_groups)
-                        put(ranges, at + 1, groups + total_groups)
+                        put(ranges, at, total + bundles)
+                        put(ranges, at + 1, total + bundles + more)
+                    elif queue != 0:
+                        evaluate(scene, k, features, hits, ahead(k.features, bundles * LANES * stride))
+                    if queue < 0:
+                        level = max(level, append(k, hits, bundles))
+                        waiting += hits
+                    elif queue > 0:
+                        active -= pass_through(scene, k, replay, hits, bundles, queue, noted)
+                        level = queue
+                    else:
+                        active -= blend_at_once(scene, k, replay, count, hits, features, bundles, noted)
+                    bundles += more
                 if overflow:
                     break
-                noted += groups
-                total_groups += groups
+                noted += bundles
+                total += bundles
                 if replay:
-                    settle(scene, k, left, right, top, bottom, noted - groups, zero, one)
+                    settle(scene, k, left, right, top, bottom, noted - bundles)
                 else:
                     write(scene, k, image, opacity, left, right, top, bottom, width, height)
             if overflow:
@@ -235,7 +195,7 @@ def _build(replay):
                 status[0] += 1
                 status[2] = hits_before
             elif not replay:
-                made[tile] = total_groups
+                made[tile] = total
 
     return work
 

@@ -5,7 +5,7 @@ Every gradient has one writer and a fixed order of summation: results do not dep
 
 import numpy as np
 
-from nbavatar.raster.binning import RECORD
+from nbavatar.raster.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
 from nbavatar.raster.compile import inlined, kernel
 from nbavatar.raster.cpu_hits import (
     cells,
@@ -17,7 +17,9 @@ from nbavatar.raster.cpu_hits import (
     plane_slopes,
     read_limits,
     slopes,
+    spread_limits,
 )  # fmt: skip
+from nbavatar.raster.cpu_scratch import COLUMN, ROW
 from nbavatar.raster.lanes import (
     LANES,
     any_lane,
@@ -27,10 +29,10 @@ from nbavatar.raster.lanes import (
     first_lanes,
     load,
     load_where,
-    ramp,
     spread,
     store,
     store_where,
+    to_real,
     total,
     transpose,
 )  # fmt: skip
@@ -39,7 +41,7 @@ from nbavatar.raster.memory import ahead, fetch_add, get, pointer, prefetch, put
 __all__ = ["gather_gradients", "interleave", "scratch_size"]
 
 _AHEAD = 8192  # numbers of the next billboard's textures that are asked for in advance
-_NOTES = 8  # groups of the next tile's notes likewise
+_NOTES = 8  # bundles of the next tile's notes likewise
 
 
 def scratch_size(texels: int, channels: int) -> int:
@@ -91,10 +93,11 @@ def _add(totals, at, value):
 
 
 @inlined
-def _texels(word, k, grads, pixel, features, totals, alphas, channels, stride, right, below, zero):
+def _texels(word, k, grads, width, spots, features, totals, alphas, channels, stride, right, below, zero):
     """Adds the hits with a bit in `word` to the texels' gradients, one after the other.
 
     Args:
+        grads: gradients of the image's rows from the tile's first pixel on; spots: the hits' places in the tile.
         k: rows of LANES numbers: weights of features (0-3) and of alpha (4-7) at the four texels; results: the
             gradients' products with the four texels' features (8-11); `cell` (12): first texels, as numbers.
         totals, alphas: gradients of this billboard's features, `stride` a texel, and alpha.
@@ -112,7 +115,8 @@ def _texels(word, k, grads, pixel, features, totals, alphas, channels, stride, r
         w10, w11 = spread(get(k, 2 * LANES + lane)), spread(get(k, 3 * LANES + lane))
         d00, d01, d10, d11 = spread(zero), spread(zero), spread(zero), spread(zero)
         texel, sums = ahead(features, cell * channels), ahead(totals, cell * stride)
-        grads_here = ahead(grads, (pixel + lane) * stride)
+        spot = np.int64(get(spots, lane))
+        grads_here = ahead(grads, ((spot >> ROW) * width + (spot & COLUMN)) * stride)
         for c in range(0, channels, LANES):
             used = first_lanes(channels - c)
             grad = load(grads_here, c)
@@ -154,19 +158,20 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
         bands: in which each tile was worked on.
         sequence, first, tile, where, record, box: see Bins; `record` flat.
         ranges, made, notes, spots, base, features, alpha, limits, grads: see `blend_tiles`.
-        shape: texels, channels, width.
+        shape: texels, channels, width, tiles across.
         fresh: whether the gradients are still uninitialised memory.
         grad_features, grad_alpha: like the textures, flat.
         grad_plane: (F, 3, 3) float64; `grad_fade`: (F,) float64.
         real: scratch of this worker; see `scratch_size`.
     """
-    texels, channels, width = shape[0], shape[1], shape[2]
+    texels, channels, width, across = shape[0], shape[1], shape[2], shape[3]
     limits, record, features, alpha = (
         pointer(limits_, 0), pointer(record_, 0), pointer(features_, 0), pointer(alpha_, 0),
     )  # fmt: skip
     ranges, notes, spots, grads = pointer(ranges_, 0), pointer(notes_, 0), pointer(spots_, 0), pointer(grads_, 0)
-    common = read_limits(limits)
-    zero, step, none = get(limits, 0), min(1, texels - 1), common.zero
+    numbers = read_limits(limits)
+    common = spread_limits(numbers)
+    zero, step, none = numbers.zero, min(1, texels - 1), common.zero
     area, stride = texels * texels, (channels + LANES - 1) // LANES * LANES
     k, alphas = pointer(real, 0), pointer(real, 16 * LANES)
     totals = pointer(real, 16 * LANES + area * LANES)
@@ -180,10 +185,9 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
             break
         for order in range(begin, min(begin + chunk, len(sequence))):
             i = np.int64(sequence[order])
-            r = i * RECORD
             used = False
             x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
-            patch = patch_of(record, r)
+            patch = patch_of(ahead(record, i * RECORD))
             s_x, s_y, s_1, t_x, t_y, t_1, w_x, w_y, w_1, g_fade = (
                 none, none, none, none, none, none, none, none, none, none,
             )  # fmt: skip
@@ -198,14 +202,16 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
                 if tile[entry] < first_tile or tile[entry] >= end_tile:
                     continue
                 noted = made[tile[entry]] - base
+                left, top = tile[entry] % across * TILE_WIDTH, tile[entry] // across * TILE_HEIGHT
+                there = ahead(grads, (np.int64(top) * width + left) * stride)
                 if entry + 1 < first[order + 1]:  # and the notes of the next tile
                     at = get(ranges, 2 * where[entry + 1]) + made[tile[entry + 1]] - base
                     for j in range(0, _NOTES * 2 * LANES, 64 // alpha_.itemsize):
                         prefetch(notes, 2 * LANES * at + j)
                 for band in range(bands):
                     at = 2 * (band * len(where) + where[entry])
-                    for group in range(noted + get(ranges, at), noted + get(ranges, at + 1)):
-                        share, by_a = load(notes, 2 * LANES * group), load(notes, 2 * LANES * group + LANES)
+                    for bundle in range(noted + get(ranges, at), noted + get(ranges, at + 1)):
+                        share, by_a = load(notes, 2 * LANES * bundle), load(notes, 2 * LANES * bundle + LANES)
                         hit = (share > none) | (by_a > none) | (by_a < none)
                         if not any_lane(hit):
                             continue
@@ -215,9 +221,9 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
                                 put(alphas, j, zero)
                             for j in range(area * stride):
                                 put(totals, j, zero)
-                        x, y = np.int64(get(spots, 2 * group)), np.int64(get(spots, 2 * group + 1))
-                        dx = spread(zero + np.float32(x - x_origin)) + ramp(zero)
-                        dy = spread(zero + np.float32(y - y_origin))
+                        spot = load(spots, LANES * bundle)
+                        dx = to_real((spot & spread(np.int32(COLUMN))) + spread(np.int32(left - x_origin)), zero)
+                        dy = to_real((spot >> spread(np.int32(ROW))) + spread(np.int32(top - y_origin)), zero)
                         s, t, p, _ = intersect(patch, dx, dy, common)
                         foot = footprint(s, t, common)
                         cell = cells(foot, texels)
@@ -238,9 +244,8 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
                             store(k, at_row + 2 * LANES, w * foot.y1 * foot.x0)
                             store(k, at_row + 3 * LANES, w * foot.y1 * foot.x1)
                         store(k, 12 * LANES, foot.row * spread(zero + np.float32(texels)) + foot.column)
-                        _ = cell
-                        _texels(bits(hit), k, grads, y * width + x, pointer(features_, i * area * channels),
-                                totals, alphas,
+                        _texels(bits(hit), k, there, width, ahead(spots, LANES * bundle),
+                                pointer(features_, i * area * channels), totals, alphas,
                                 channels, stride, step, step * texels, zero)  # fmt: skip
                         d00, d01, d10, d11 = (
                             load(k, 8 * LANES), load(k, 9 * LANES), load(k, 10 * LANES), load(k, 11 * LANES),

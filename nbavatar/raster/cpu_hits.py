@@ -1,7 +1,8 @@
 """Steps that the CPU kernels share: where a billboard crosses a row, and what eight pixels of it see.
 
-A *group* is eight neighbouring pixels of a row under one billboard. Groups are what the kernels
-evaluate, remember and differentiate; a *hit* is one lane of a group.
+A *group* is eight neighbouring pixels of a row under one billboard, looked at together. A *hit* is a pixel of a group
+that sees the billboard. The hits of a billboard in a tile follow each other without gaps; eight of them are a
+*bundle*, and bundles are what is remembered and differentiated.
 """
 
 from typing import Any, NamedTuple
@@ -27,8 +28,8 @@ from nbavatar.raster.lanes import (
 from nbavatar.raster.memory import ahead, get
 
 __all__ = [
-    "INFINITE", "LOWEST", "NONE", "ONE", "SIZE", "ZERO", "Footprint", "Limits", "Patch", "affine", "cells", "corners",
-    "footprint", "intersect", "mix", "patch_of", "plane_slopes", "read_limits", "slopes", "spans", "write_limits",
+    "FADE", "Footprint", "Limits", "Patch", "affine", "cells", "corners", "footprint", "intersect", "mix", "patch_of",
+    "plane_slopes", "read_limits", "slopes", "spans", "spread_limits", "write_limits",
 ]  # fmt: skip
 
 _S = scalar.build(inlined, floor, minimum, maximum, choose)
@@ -40,7 +41,7 @@ _MARGIN = 0.1  # pixels by which a row's span is widened; coverage itself is dec
 
 
 class Limits(NamedTuple):
-    """Numbers that steer the kernels, each in all lanes."""
+    """Numbers that steer the kernels, each once or in all lanes."""
 
     zero: Any
     one: Any
@@ -53,11 +54,6 @@ class Limits(NamedTuple):
     none: Any  # -infinity, the key of an empty place
     lowest: Any  # key that every hit's exceeds
     infinite: Any
-
-
-ZERO, ONE, SIZE, NONE, LOWEST, INFINITE = (
-    Limits._fields.index(name) for name in ("zero", "one", "size", "none", "lowest", "infinite")
-)
 
 
 class Patch(NamedTuple):
@@ -74,6 +70,9 @@ class Patch(NamedTuple):
     w_1: Any
     key: Any
     fade: Any
+
+
+FADE = Patch._fields.index("fade")
 
 
 class Footprint(NamedTuple):
@@ -96,26 +95,35 @@ def write_limits(texels: int, near: float, alpha_min: float, t_min: float, alpha
 
 @inlined
 def read_limits(limits):
-    """Spreads the array of `write_limits`."""
+    """The numbers in the array of `write_limits`."""
     return Limits(
-        spread(get(limits, 0)), spread(get(limits, 1)), spread(get(limits, 2)), spread(get(limits, 3)),
-        spread(get(limits, 4)), spread(get(limits, 5)), spread(get(limits, 6)), spread(get(limits, 7)),
-        spread(get(limits, 8)), spread(get(limits, 9)), spread(get(limits, 10)),
+        get(limits, 0), get(limits, 1), get(limits, 2), get(limits, 3), get(limits, 4), get(limits, 5),
+        get(limits, 6), get(limits, 7), get(limits, 8), get(limits, 9), get(limits, 10),
     )  # fmt: skip
 
 
 @inlined
-def patch_of(record, r):
-    """Spreads the record that begins at r."""
+def spread_limits(numbers):
+    """The same in all lanes."""
+    return Limits(
+        spread(numbers.zero), spread(numbers.one), spread(numbers.size), spread(numbers.step),
+        spread(numbers.inverse_near), spread(numbers.alpha_min), spread(numbers.t_min), spread(numbers.alpha_max),
+        spread(numbers.none), spread(numbers.lowest), spread(numbers.infinite),
+    )  # fmt: skip
+
+
+@inlined
+def patch_of(record):
+    """Spreads a billboard's record."""
     return Patch(
-        spread(get(record, r)), spread(get(record, r + 1)), spread(get(record, r + 2)), spread(get(record, r + 3)),
-        spread(get(record, r + 4)), spread(get(record, r + 5)), spread(get(record, r + 6)), spread(get(record, r + 7)),
-        spread(get(record, r + 8)), spread(get(record, r + 9)), spread(get(record, r + 10)),
+        spread(get(record, 0)), spread(get(record, 1)), spread(get(record, 2)), spread(get(record, 3)),
+        spread(get(record, 4)), spread(get(record, 5)), spread(get(record, 6)), spread(get(record, 7)),
+        spread(get(record, 8)), spread(get(record, 9)), spread(get(record, 10)),
     )  # fmt: skip
 
 
 @inlined
-def spans(record, r, size, one, x_first, x_end, x_origin, y_first, y_end, y_origin, ends):
+def spans(record, size, one, x_first, x_end, x_origin, y_first, y_end, y_origin, ends):
     """Columns of each row, of x_first ... x_end, that the patch may cover.
 
     Texel coordinates lie in (-1, size) where four affine functions are positive: s + w, size w - s and the
@@ -123,12 +131,12 @@ def spans(record, r, size, one, x_first, x_end, x_origin, y_first, y_end, y_orig
     """
     zero = one - one
     margin = spread(zero + np.float32(_MARGIN))
-    w_x, w_y, w_1 = get(record, r + 6), get(record, r + 7), get(record, r + 8)
+    w_x, w_y, w_1 = get(record, 6), get(record, 7), get(record, 8)
     for k in range(0, y_end - y_first, LANES):
         dy = spread(zero + np.float32(y_first + k - y_origin)) + ramp(zero)
         low, high = spread(zero + np.float32(x_first - x_origin)), spread(zero + np.float32(x_end - 1 - x_origin))
         for side in range(4):
-            at = r + 3 * (side >> 1)
+            at = 3 * (side >> 1)
             p_x, p_y, p_1 = get(record, at), get(record, at + 1), get(record, at + 2)
             if side & 1 == 0:
                 slope, by_y, rest = p_x + w_x, p_y + w_y, p_1 + w_1

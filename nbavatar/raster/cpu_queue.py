@@ -1,21 +1,21 @@
 """Queues of hits, one a pixel, which wait until nothing nearer can come.
 
-They are stored slot by slot: slot j of all pixels, then slot j + 1. In `ray` order a hit is put behind those that
-wait, and the queues are sorted when it is looked which hits are final, those of eight pixels at a time by the same
-comparisons: no branch depends on a single pixel. With a queue of n hits they are kept sorted, the nearest in slot 0.
+They are stored slot by slot: slot j of all pixels, then slot j + 1. A hit is put behind those that wait. In `ray`
+order the queues are sorted when it is looked which hits are final, those of eight pixels at a time by the same
+comparisons: no branch depends on a single pixel. With `kbuffer(n)` the nearest of n + 1 hits is blended.
 """
 
 import numpy as np
 
 from nbavatar.raster.compile import inlined
-from nbavatar.raster.cpu_pixels import SHIFT, blend, close
+from nbavatar.raster.cpu_pixels import blend, blend_one, close
+from nbavatar.raster.cpu_scratch import SHIFT
 from nbavatar.raster.lanes import (
     LANES,
     any_lane,
     choose,
     first_lanes,
     gather,
-    lane_numbers,
     largest,
     load,
     maximum,
@@ -26,77 +26,87 @@ from nbavatar.raster.lanes import (
 from nbavatar.raster.memory import get, put
 from nbavatar.raster.sorting import LONGEST, merge_exchange, network
 
-__all__ = ["append", "drain", "enqueue", "pop"]
+__all__ = ["append", "drain", "pass_through"]
 
 _sort_2, _sort_4, _sort_8, _sort_all = network(2), network(4), network(8), network(LONGEST)
 _sort_any = inlined(merge_exchange)
 
 
 @inlined
-def append(scene, k, j, group, first):
-    """Puts the hits of group j of the billboard in hand behind the queues of the pixels `first + lane`.
-
-    A lane without a hit is written as well, to a place that stays free.
-
-    Returns:
-        How many hits wait at each of the pixels then.
-    """
-    for lane in range(LANES):
-        at, number = np.int64(get(k.free, first + lane)), group * LANES + lane
-        put(k.keys, at, get(k.key, j * LANES + lane))
-        put(k.opacities, at, get(k.opacity, number))
-        put(k.ids, at, number)
-    hit = truths(load(k.key, j * LANES) > scene.limits.none)
-    count = load(k.count, first) + hit
-    store(k.count, first, count)
-    store(k.free, first, load(k.free, first) + hit * spread(np.int32(scene.plane)))
+def _put_behind(k, h, pixel, number):
+    """Writes hit h of the billboard in hand behind those that wait at its pixel; returns how many they were."""
+    groups, queues, hit = k.groups, k.queues, np.int64(get(k.groups.hit, h))
+    count = np.int64(get(queues.count, pixel))
+    at = count * queues.plane + pixel
+    put(queues.keys, at, get(groups.key, hit))
+    put(queues.opacities, at, get(groups.alpha, hit))
+    put(queues.ids, at, number)
     return count
 
 
 @inlined
-def enqueue(scene, k, key, group, first, level):
-    """Puts hits into the sorted queues of the pixels `first + lane`; returns how many slots are in use then.
+def append(k, hits, bundles):
+    """Puts the hits of the billboard in hand behind the queues of their pixels.
 
-    Of equal keys the one of lower rank goes first.
+    Args:
+        bundles: of hits that the band had before.
+
+    Returns:
+        How many hits wait then at the pixel with the most of them.
     """
-    none, shift = scene.limits.none, spread(np.int32(SHIFT))
-    ids, opacity = spread(np.int32(group * LANES)) + lane_numbers(), load(k.opacity, group * LANES)
-    slot = 0
-    while True:
-        at = slot * scene.plane + first
-        held, held_id, held_opacity = load(k.keys, at), load(k.ids, at), load(k.opacities, at)
-        ahead = key > held
-        tie = (key == held) & (key > none)
-        if any_lane(tie):
-            ahead = ahead | (tie & (gather(k.rank, ids >> shift) < gather(k.rank, held_id >> shift)))
-        store(k.keys, at, choose(ahead, key, held))
-        store(k.ids, at, choose(ahead, ids, held_id))
-        store(k.opacities, at, choose(ahead, opacity, held_opacity))
-        key, ids, opacity = choose(ahead, held, key), choose(ahead, held_id, ids), choose(ahead, held_opacity, opacity)
-        slot += 1
-        if not any_lane(key > none):
-            return max(level, slot)
+    most = 0
+    for h in range(hits):
+        pixel = np.int64(get(k.groups.spot, h))
+        count = _put_behind(k, h, pixel, bundles * LANES + h) + 1
+        put(k.queues.count, pixel, count)
+        most = max(most, count)
+    return most
 
 
 @inlined
-def pop(scene, k, replay, first, full, level, noted):
-    """Blends the nearest hit of the queues in the mask `full`; returns the number of pixels that this has finished."""
-    one, none = scene.limits.one, scene.limits.none
-    through, opacity = load(k.through, first), load(k.opacities, first)
-    blend(scene, k, replay, full, first, through, through * opacity, load(k.ids, first), noted)
-    through = choose(full, through * (one - opacity), through)
-    store(k.through, first, through)
-    done, finished = close(scene, k, first, through)
-    for slot in range(level):
-        to, at = slot * scene.plane + first, (slot + 1) * scene.plane + first
-        key = load(k.keys, to)
-        if slot + 1 < level:
-            key = choose(full, load(k.keys, at), key)
-            store(k.ids, to, choose(full, load(k.ids, at), load(k.ids, to)))
-            store(k.opacities, to, choose(full, load(k.opacities, at), load(k.opacities, to)))
-        else:
-            key = choose(full, none, key)
-        store(k.keys, to, choose(done, none, key))
+def _nearest(k, pixel, length):
+    """Place of the nearest hit in a queue: the one with the greatest key, of equal ones with the lowest rank."""
+    queues = k.queues
+    nearest, best = pixel, get(queues.keys, pixel)
+    for slot in range(1, length):
+        at = slot * queues.plane + pixel
+        key = get(queues.keys, at)
+        if key == best:
+            bundle, other = np.int64(get(queues.ids, at)) >> SHIFT, np.int64(get(queues.ids, nearest)) >> SHIFT
+            nearest = at if get(k.rank, bundle) < get(k.rank, other) else nearest
+        nearest, best = at if key > best else nearest, key if key > best else best
+    return nearest
+
+
+@inlined
+def pass_through(scene, k, replay, hits, bundles, length, noted):
+    """Puts hits behind queues of a fixed length; where one gets longer, its nearest hit is blended.
+
+    Args:
+        bundles: of hits that the band had before; noted: place of the first of them among the notes.
+
+    Returns:
+        Number of pixels that this has finished.
+    """
+    plane, finished = np.int64(k.queues.plane), 0
+    for h in range(hits):
+        pixel = np.int64(get(k.groups.spot, h))
+        count = _put_behind(k, h, pixel, bundles * LANES + h)
+        if count < length:
+            put(k.queues.count, pixel, count + 1)
+            continue
+        last, nearest = count * plane + pixel, _nearest(k, pixel, length + 1)
+        through, opacity = get(k.through, pixel), get(k.queues.opacities, nearest)
+        blend_one(scene, k, replay, pixel, np.int64(get(k.queues.ids, nearest)), through, opacity, noted)
+        put(k.queues.keys, nearest, get(k.queues.keys, last))
+        put(k.queues.opacities, nearest, get(k.queues.opacities, last))
+        put(k.queues.ids, nearest, get(k.queues.ids, last))
+        through = through * (scene.numbers.one - opacity)
+        put(k.through, pixel, through)
+        if through < scene.numbers.t_min:
+            put(k.floor, pixel, scene.numbers.infinite)
+            put(k.queues.count, pixel, 0)
+            finished += 1
     return finished
 
 
@@ -104,39 +114,39 @@ def pop(scene, k, replay, first, full, level, noted):
 def _exchange(queues, i, j):
     """Brings slots i and j of the same queues in order: by key, equal ones by rank."""
     scene, k, first = queues
-    a, b = i * scene.plane + first, j * scene.plane + first
-    key, other = load(k.keys, a), load(k.keys, b)
-    number, other_number = load(k.ids, a), load(k.ids, b)
-    opacity, other_opacity = load(k.opacities, a), load(k.opacities, b)
+    a, b = i * k.queues.plane + first, j * k.queues.plane + first
+    key, other = load(k.queues.keys, a), load(k.queues.keys, b)
+    number, other_number = load(k.queues.ids, a), load(k.queues.ids, b)
+    opacity, other_opacity = load(k.queues.opacities, a), load(k.queues.opacities, b)
     behind, tie = key < other, (key == other) & (key > scene.limits.none)
     if any_lane(tie):
         shift = spread(np.int32(SHIFT))
         behind = behind | (tie & (gather(k.rank, other_number >> shift) < gather(k.rank, number >> shift)))
-    store(k.keys, a, choose(behind, other, key))
-    store(k.keys, b, choose(behind, key, other))
-    store(k.ids, a, choose(behind, other_number, number))
-    store(k.ids, b, choose(behind, number, other_number))
-    store(k.opacities, a, choose(behind, other_opacity, opacity))
-    store(k.opacities, b, choose(behind, opacity, other_opacity))
+    store(k.queues.keys, a, choose(behind, other, key))
+    store(k.queues.keys, b, choose(behind, key, other))
+    store(k.queues.ids, a, choose(behind, other_number, number))
+    store(k.queues.ids, b, choose(behind, number, other_number))
+    store(k.queues.opacities, a, choose(behind, other_opacity, opacity))
+    store(k.queues.opacities, b, choose(behind, opacity, other_opacity))
 
 
 @inlined
 def _sort(scene, k, first, count, most):
     """Sorts the queues `first + lane`, in which `count` hits wait, `most` at most."""
-    plane, none = scene.plane, scene.limits.none
+    plane, none = k.queues.plane, scene.limits.none
     if most <= 2:
-        tied = _sort_2(k.keys, k.opacities, k.ids, first, plane, count, none)
+        tied = _sort_2(k.queues.keys, k.queues.opacities, k.queues.ids, first, plane, count, none)
     elif most <= 4:
-        tied = _sort_4(k.keys, k.opacities, k.ids, first, plane, count, none)
+        tied = _sort_4(k.queues.keys, k.queues.opacities, k.queues.ids, first, plane, count, none)
     elif most <= 8:
-        tied = _sort_8(k.keys, k.opacities, k.ids, first, plane, count, none)
+        tied = _sort_8(k.queues.keys, k.queues.opacities, k.queues.ids, first, plane, count, none)
     elif most <= LONGEST:
-        tied = _sort_all(k.keys, k.opacities, k.ids, first, plane, count, none)
+        tied = _sort_all(k.queues.keys, k.queues.opacities, k.queues.ids, first, plane, count, none)
     else:
         tied = first_lanes(0)
         for slot in range(most):
             at = slot * plane + first
-            store(k.keys, at, choose(count > spread(np.int32(slot)), load(k.keys, at), none))
+            store(k.queues.keys, at, choose(count > spread(np.int32(slot)), load(k.queues.keys, at), none))
     if most > LONGEST or any_lane(tied):
         _sort_any(most, _exchange, (scene, k, first))
 
@@ -159,7 +169,7 @@ def drain(scene, k, replay, reach, pixels, noted):
     near, zero = spread(reach), spread(np.int32(0))
     in_use, waiting, finished = 0, 0, 0
     for first in range(0, pixels, LANES):
-        count = load(k.count, first)
+        count = load(k.queues.count, first)
         most = np.int64(largest(count))
         if most == 0:
             continue
@@ -168,8 +178,8 @@ def drain(scene, k, replay, reach, pixels, noted):
         behind, held = through, zero  # transmittance behind all hits so far, and their number
         gone = most  # slots in front of the first in which a hit has to wait
         for slot in range(most):
-            at = slot * scene.plane + first
-            key, opacity, ids = load(k.keys, at), load(k.opacities, at), load(k.ids, at)
+            at = slot * k.queues.plane + first
+            key, opacity, ids = load(k.queues.keys, at), load(k.queues.opacities, at), load(k.queues.ids, at)
             some, final = key > none, key >= near
             now = some & final & (through >= t_min)
             if any_lane(now):
@@ -181,18 +191,17 @@ def drain(scene, k, replay, reach, pixels, noted):
             if gone < slot or any_lane(waits):
                 gone = min(gone, slot)
                 floor = choose(waits & (behind < t_min), maximum(floor, key), floor)
-                to = at - gone * scene.plane
-                store(k.keys, to, choose(waits, key, none))
-                store(k.opacities, to, opacity)
-                store(k.ids, to, ids)
+                to = at - gone * k.queues.plane
+                store(k.queues.keys, to, choose(waits, key, none))
+                store(k.queues.opacities, to, opacity)
+                store(k.queues.ids, to, ids)
         store(k.through, first, through)
         store(k.floor, first, floor)
         done, closed = close(scene, k, first, through)
         finished += closed
         held = held - spread(np.int32(gone))
         held = choose(done, zero, choose(held > zero, held, zero))
-        store(k.count, first, held)
-        store(k.free, first, held * spread(np.int32(scene.plane)) + (spread(np.int32(first)) + lane_numbers()))
+        store(k.queues.count, first, held)
         most = np.int64(largest(held))
         in_use = max(in_use, most)
         waiting += LANES * most

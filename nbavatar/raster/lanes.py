@@ -17,8 +17,8 @@ from numba.extending import intrinsic, models, register_model
 
 __all__ = [
     "LANES", "any_lane", "bits", "choose", "count_bits", "count_trailing_zeros", "first_lanes", "floor", "gather",
-    "gather_pairs", "is_nan", "lane_numbers", "largest", "load", "load_where", "maximum", "minimum", "ramp", "spread",
-    "store", "store_where", "stream", "to_int", "to_real", "total", "transpose", "truths",
+    "gather_pairs", "is_nan", "lane_numbers", "lanes_of", "largest", "load", "load_where", "maximum", "minimum", "ramp",
+    "spread", "store", "store_where", "stream", "to_int", "to_real", "total", "transpose", "truths",
 ]  # fmt: skip
 
 LANES = 8
@@ -355,6 +355,22 @@ def bits(typingctx: Any, mask: Any) -> Any:
         return builder.zext(builder.bitcast(args[0], _WORD), _I64)
 
     return types.int64(_MASK), generate
+
+
+@intrinsic
+def lanes_of(typingctx: Any, word: Any) -> Any:
+    """The numbers of the lanes in a mask's `bits`, one behind the other, and then zeros: int32."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        small = ir.VectorType(ir.IntType(8), LANES)
+        table = ir.ArrayType(small, 1 << LANES)
+        held = [[lane for lane in range(LANES) if word >> lane & 1] for word in range(1 << LANES)]
+        rows = [ir.Constant(small, (lanes + [0] * LANES)[:LANES]) for lanes in held]
+        base = cgutils.global_constant(builder, "lanes_of", ir.Constant(table, rows))
+        row = builder.load(builder.gep(base, [ir.Constant(_I64, 0), args[0]]))
+        return builder.zext(row, ir.VectorType(_I32, LANES))
+
+    return _WHOLE(types.int64), generate
 
 
 @intrinsic

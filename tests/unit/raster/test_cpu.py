@@ -185,6 +185,22 @@ def test_a_picture_written_past_the_caches_is_the_same():
     assert torch.equal(opacity[..., :1021], other_opacity)
 
 
+def test_a_replay_that_finds_other_hits_is_refused(monkeypatch):
+    """The notes' memory is laid out by what the forward pass has found: nothing may be written beyond it."""
+    forward = cpu._Scene.forward
+
+    def short(scene):
+        result = forward(scene)
+        scene.made[scene.made.argmax()] -= 1
+        return result
+
+    monkeypatch.setattr(cpu._Scene, "forward", short)
+    scene = [tensor.requires_grad_() for tensor in random_billboards(25, 40, 4, 3)]
+    image, _ = render_billboards(*scene, *camera(64, 48), 64, 48)
+    with pytest.raises(RuntimeError, match="other hits than the forward pass"):
+        image.sum().backward()
+
+
 def test_alpha_of_zero_and_one():
     scene = random_billboards(15, 30, 4, 3, torch.float32)
     scene[4] = (scene[4] > 0.5).float()
