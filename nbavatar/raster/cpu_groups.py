@@ -129,8 +129,9 @@ def list_hits(scene, k, record, alpha, count):
         store(groups.hit, hits, spread(np.int32(at)) + lanes)
         store(groups.spot, hits, spread(get(groups.first, j)) + lanes)
         hits += count_bits(word)
-    store(groups.hit, hits, lane_numbers())  # where hits are taken LANES at a time, the last may be of any lane
-    store(groups.spot, hits, lane_numbers())
+    nothing = spread(np.int32(0))  # where hits are taken LANES at a time, the band's first pixel fills up
+    store(groups.hit, hits, nothing)
+    store(groups.spot, hits, nothing)
     return hits, any_lane(broken)
 
 

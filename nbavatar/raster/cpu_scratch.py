@@ -32,7 +32,7 @@ class Groups(NamedTuple):
     weights: Any  # of the four, PART apart
     alpha: Any  # opacity
     share: Any  # where a hit is blended at once: its share of the light, in the replay the light that reaches it
-    # hit by hit, and those of the first LANES lanes
+    # hit by hit, and LANES zeros behind them
     hit: Any  # lane of the groups
     spot: Any  # place of the pixel in the band
 
