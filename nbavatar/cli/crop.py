@@ -4,8 +4,8 @@ Reads the frame packs of `nbavatar ingest` (rgb) and `nbavatar masks` (label, al
 from the first), and for box crops the mesh sequence with the tracked boxes. Writes a frame pack:
 
   rgb       uint8 [S, S, 3]   sRGB
-  label     uint8 [S, S]      0 background, 1 head, 2 right hand, 3 left hand
-  alpha     uint8 [S, S]      coverage; 0 where the crop sticks out of the native image
+  label     uint8 [S, S]      0 background, 1 head, 2 right hand, 3 left hand, 255 outside the native image
+  alpha     uint8 [S, S]      coverage
 
 with K [px] of the cropped images (K_per_frame where boxes move), distortion null, and everything else as it was.
 Kinds: `center`, the largest centred square (the paper's 1024 protocol); `box`, a square over the tracked head and hand
@@ -28,7 +28,7 @@ from nbavatar.data.sources import LAYERS
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.image.crop import Window, resize_area, resize_labels
 from nbavatar.image.foreground import estimate_foreground
-from nbavatar.io.framepack import FramePack, FramePackWriter
+from nbavatar.io.framepack import UNSEEN, FramePack, FramePackWriter
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
@@ -69,19 +69,23 @@ def main(args: argparse.Namespace) -> None:
         record = run_record("crop", config=to_mapping(cfg), inputs=inputs, extra=extra)
         layers = {name: LAYERS[name] for name in ("rgb", "label", "alpha")}
         target: dict[str, Any] = {**manifest, "stage": "crop", "layers": layers, "record": record, "distortion": None,
-                                  "width": plan.size, "height": plan.size, "K": plan.K[frames[0]].tolist()}  # fmt: skip
+                                  "width": plan.size, "height": plan.size, "K": plan.K[frames[0]].tolist(),
+                                  "unseen": False}  # fmt: skip
         if plan.moving:
             target["K_per_frame"] = {frame: plan.K[frame].tolist() for frame in frames}
         with FramePackWriter(args.out, target) as out:
-            window = None
+            window = unseen = None
             for frame in progress(frames, f"crop {manifest['subject']}/{camera.name}", len(frames)):
                 if window is None or (window.x0, window.y0, window.side) != plan.windows[frame]:
                     window = Window(*plan.windows[frame], camera.K, lens)
+                    unseen = window.unseen(camera.height, camera.width, plan.size)
+                    out.manifest["unseen"] |= bool(unseen.any())
                 label = window.cut(masks.read("label", frame), labels=True)
                 alpha = window.cut(masks.read("alpha", frame))
                 rgb = window.cut(pack.read("rgb", frame))
                 rgb = resize_area(rgb, plan.size)
                 label, alpha = resize_labels(label, alpha, plan.size)
+                label[unseen], alpha[unseen] = UNSEEN, 0
                 out.add("rgb", frame, estimate_foreground(rgb, alpha) if cfg.edge_color else rgb)
                 out.add("label", frame, label)
                 out.add("alpha", frame, alpha)

@@ -27,6 +27,7 @@ from nbavatar.config.core import from_mapping, merge, to_mapping
 from nbavatar.config.evaluation import PROTOCOLS, EvaluateConfig, ProtocolConfig, protocol_hash
 from nbavatar.devices import device_name, lease_device
 from nbavatar.errors import DataError
+from nbavatar.image.crop import blank_unseen
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import write_json
@@ -131,7 +132,8 @@ def _evaluate(
         for name in render.frames:
             camera, _, frame = name.partition("/")
             pack = truths[camera]
-            yield Pair(camera, frame, render.read("rgb", name), pack.read("rgb", frame), pack.read("alpha", frame))
+            prediction = blank_unseen(render.read("rgb", name), pack.unseen(frame), protocol.background)
+            yield Pair(camera, frame, prediction, pack.read("rgb", frame), pack.read("alpha", frame))
 
     result = evaluate(
         progress(pairs(), f"evaluate {protocol.name}", len(render.frames)),

@@ -20,6 +20,7 @@ from nbavatar.cli.evaluate import read_protocol
 from nbavatar.config.core import to_mapping
 from nbavatar.devices import lease_device
 from nbavatar.errors import DataError
+from nbavatar.image.crop import blank_unseen
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import write_json
@@ -67,8 +68,11 @@ def main(args: argparse.Namespace) -> int:
         def images(name: str) -> Images:
             camera, _, frame = name.partition("/")
             pack = truths[camera]
-            opacity = render.read("alpha", name) if "alpha" in render.layers else None
-            return Images(camera, render.read("rgb", name), opacity, pack.read("rgb", frame), pack.read("alpha", frame))
+            opacity, unseen = render.read("alpha", name) if "alpha" in render.layers else None, pack.unseen(frame)
+            if opacity is not None and unseen is not None:
+                opacity[unseen] = 0
+            rgb = blank_unseen(render.read("rgb", name), unseen, protocol.background)
+            return Images(camera, rgb, opacity, pack.read("rgb", frame), pack.read("alpha", frame))
 
         names = spread(render.frames, args.max_frames)
         nets = {net: load_lpips(net) for net in args.nets}

@@ -272,7 +272,10 @@ def _shots(
         if (view.width, view.height) != size:
             expected, found = f"{size[0]}x{size[1]} as the first camera", f"{view.width}x{view.height}"
             raise DataError.of(packs[view.pack].path, "size", expected=expected, found=found)
-    truths = [(packs[view.pack].read("rgb", view.frame), packs[view.pack].read("alpha", view.frame)) for view in chosen]
+    truths = [
+        (packs[v.pack].read("rgb", v.frame), packs[v.pack].read("alpha", v.frame), packs[v.pack].unseen(v.frame))
+        for v in chosen
+    ]
     times = max(1, math.ceil(args.side / max(size)))
     shots = prepare_shots(
         sequence, parts, chosen, truths, protocol.background, net, refined=protocol.refined, enlarge=times,

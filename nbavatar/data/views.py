@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
-from nbavatar.io.framepack import FramePack
+from nbavatar.io.framepack import UNSEEN, FramePack
 
 __all__ = ["Sample", "View", "ViewStore", "ViewStream", "shuffled", "views_of"]
 
@@ -128,7 +128,8 @@ class ViewStore:
     Args:
         packs: opened frame packs.
         views: from `views_of`.
-        parts: parts that are modelled; pixels of other labelled parts are marked as ignored.
+        parts: parts that are modelled; pixels of other labelled parts, and those outside the camera's image, are
+            marked as ignored.
         cache_bytes: most memory for decoded views [bytes].
     """
 
@@ -188,8 +189,8 @@ class ViewStore:
                 expected, found = f"{view.width}x{view.height}", f"{image.shape[1]}x{image.shape[0]}"
                 raise DataError.of(pack.path, f"{layer}/{view.frame}", expected=expected, found=found)
         ignored = np.zeros_like(alpha)
-        if self._excluded and "label" in pack.layers:
-            ignored[np.isin(pack.read("label", view.frame), self._excluded)] = 255
+        if "label" in pack.layers and (self._excluded or pack.manifest.get("unseen")):
+            ignored[np.isin(pack.read("label", view.frame), [*self._excluded, UNSEEN])] = 255
             alpha = np.where(ignored > 0, 0, alpha).astype(np.uint8)
         self.decoded += 1
         used = (alpha > 0) | (ignored > 0)

@@ -1,8 +1,13 @@
 """Windows cut out of images, lens distortion removed on the way, and exact area resizing.
 
-A window may stick out of the image; what lies outside is 0. With pixel centres at +0.5 the camera matrix of the result
-is that of `camera.pinhole.crop_intrinsics` followed by `scale_intrinsics`, with no half-pixel terms.
+A window may stick out of the image, and an undistorted image ends in curves; what lies outside is 0, and nothing is
+known of it: neither training nor evaluation may take it for background.
+
+With pixel centres at +0.5 the camera matrix of the result is that of `camera.pinhole.crop_intrinsics` followed by
+`scale_intrinsics`, with no half-pixel terms.
 """
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -10,7 +15,9 @@ import numpy as np
 from nbavatar.camera.distortion import undistortion_map
 from nbavatar.camera.pinhole import crop_intrinsics
 
-__all__ = ["Window", "resize_area", "resize_labels"]
+__all__ = ["Window", "blank_unseen", "resize_area", "resize_labels"]
+
+_RIM = 2  # pixels at an image's border that cubic interpolation mixes with what lies outside
 
 
 class Window:
@@ -44,6 +51,24 @@ class Window:
             rows, columns = slice(top - self.y0, bottom - self.y0), slice(left - self.x0, right - self.x0)
             result[rows, columns] = image[top:bottom, left:right]
         return result
+
+    def unseen(self, height: int, width: int, size: int) -> np.ndarray:
+        """Pixels of the window, resized to `size`, that images of this size do not determine: bool `[size, size]`."""
+        image = np.full((height, width), 255, dtype=np.uint8)
+        if self._map is not None:
+            image[:_RIM] = image[-_RIM:] = image[:, :_RIM] = image[:, -_RIM:] = 0
+        return resize_area(np.where(self.cut(image) < 255, np.uint8(255), np.uint8(0)), size) > 0
+
+
+def blank_unseen(image: np.ndarray, unseen: np.ndarray | None, background: Sequence[float]) -> np.ndarray:
+    """A picture uint8 `[H, W, 3]` with the background (sRGB in [0, 1]) at pixels of which there is no truth.
+
+    So it can be compared with a truth that has the background there as well. One of another size is left as it is:
+    whoever compares says so.
+    """
+    if unseen is None or unseen.shape != image.shape[:2]:
+        return image
+    return np.where(unseen[..., None], np.round(255 * np.asarray(background)).astype(np.uint8), image)
 
 
 def resize_area(image: np.ndarray, size: int) -> np.ndarray:

@@ -9,6 +9,9 @@ is compressed already; PNG, because it is lossless and everything opens it.
     person  matte of the whole person, as delivered      uint8 [H, W]
     label   0 background, 1 head, 2 right, 3 left hand   uint8 [H, W]
     alpha   coverage of the labelled parts, 255 = full   uint8 [H, W]
+
+In a crop that sticks out of the camera's image, what lies outside has the label `UNSEEN`, and the manifest tells by
+`unseen` whether there is any.
 """
 
 import json
@@ -26,9 +29,10 @@ from nbavatar.io.atomic import atomic_write
 from nbavatar.io.images import decode_image, encode_png
 from nbavatar.io.records import canonical_json
 
-__all__ = ["FORMAT", "FramePack", "FramePackWriter"]
+__all__ = ["FORMAT", "UNSEEN", "FramePack", "FramePackWriter"]
 
 FORMAT = 1
+UNSEEN = 255
 _MANIFEST = "manifest.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _REQUIRED = ("stage", "subject", "camera", "width", "height", "cam_from_world", "frames", "layers")
@@ -131,6 +135,10 @@ class FramePack:
         except (zipfile.BadZipFile, OSError, EOFError) as error:
             raise DataError.of(self.path, name, expected="a whole image", found=f"damage ({error})") from error
         return decode_image(encoded, f"{self.path}: {name}")
+
+    def unseen(self, frame: str) -> np.ndarray | None:
+        """Pixels of which the camera's image says nothing, bool `[H, W]`; None where there are none in any frame."""
+        return self.read("label", frame) == UNSEEN if self.manifest.get("unseen") else None
 
     def intrinsics(self, frame: str) -> np.ndarray:
         """Camera matrix of one frame, float64 `[3, 3]` [px], of the images in this pack."""

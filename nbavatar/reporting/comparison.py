@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from nbavatar.image.crop import blank_unseen
 from nbavatar.io.framepack import FramePack
 from nbavatar.reporting.insets import contact_pixels, contact_window, cut
 from nbavatar.reporting.page import Card, Strip
@@ -124,11 +125,11 @@ def frames_in_contact(names: Sequence[str], pack: FramePack, crops: Sequence[Fra
 def compare_frame(name: str, group: Sequence[Rendered], crops: Sequence[FramePack]) -> Comparison:
     """One frame ``<camera>/<frame>``: the truth where there is one, then every method of the group that has it."""
     camera, _, frame = name.partition("/")
-    truth, window = None, None
+    truth, window, unseen = None, None, None
     columns = []
     crop = find_truth(group[0].pack, name, crops)
     if crop is not None:
-        alpha = crop.read("alpha", frame)
+        alpha, unseen = crop.read("alpha", frame), crop.unseen(frame)
         truth = _composite(crop.read("rgb", frame), alpha, group[0].background)
         window = contact_window(crop.read("label", frame) if "label" in crop.layers else None, alpha)
         picture = np.round(truth * 255).astype(np.uint8)
@@ -143,7 +144,7 @@ def compare_frame(name: str, group: Sequence[Rendered], crops: Sequence[FramePac
         if "nb_alpha" in render.pack.layers:
             pictures["coverage"] = render.pack.read("nb_alpha", name)
         if truth is not None and truth.shape == rgb.shape:
-            pictures["error"] = error_map(rgb, truth)
+            pictures["error"] = error_map(blank_unseen(rgb, unseen, render.background), truth)
         columns.append(Column(render.variant, pictures, render.per_image.get(name, {})))
     return Comparison(camera, frame, columns, window)
 

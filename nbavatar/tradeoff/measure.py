@@ -50,6 +50,7 @@ class Shot:
         background: RGB (3,).
         truth: on that background, float32 (1, 3, H, W).
         mask: foreground, bool (1, H, W).
+        unseen: pixels without truth, bool (H, W), or None.
         features: LPIPS features of the truth.
     """
 
@@ -61,6 +62,7 @@ class Shot:
     background: Tensor
     truth: Tensor
     mask: Tensor
+    unseen: Tensor | None
     features: Sequence[Tensor]
 
     def render(self, avatar: TunedAvatar, laps: Any = None) -> tuple[Tensor, Tensor, Tensor]:
@@ -75,7 +77,7 @@ def prepare_shots(
     sequence: MeshSequence,
     parts: Sequence[str],
     views: Sequence[View],
-    truths: Sequence[tuple[np.ndarray, np.ndarray]],
+    truths: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray | None]],
     background: Sequence[float],
     net: LPIPS,
     *,
@@ -89,7 +91,8 @@ def prepare_shots(
         sequence: meshes of the frames.
         parts: parts of the avatar.
         views: cameras and frames.
-        truths: colours uint8 (H, W, 3) and coverage uint8 (H, W) of each view.
+        truths: colours uint8 (H, W, 3) and coverage uint8 (H, W) of each view, and the pixels that its camera did not
+            see, bool (H, W), if there are any.
         background: sRGB in [0, 1].
         net: LPIPS on `device`.
         refined: whether training frames use their refinement.
@@ -97,7 +100,7 @@ def prepare_shots(
         device: where the avatar computes.
     """
     shots = []
-    for view, (rgb, alpha) in zip(views, truths, strict=True):
+    for view, (rgb, alpha, unseen) in zip(views, truths, strict=True):
         truth = torch.from_numpy(composite(rgb, alpha, background).transpose(2, 0, 1).copy())[None].to(device)
         with torch.inference_mode():
             features = net.features(truth)
@@ -111,7 +114,8 @@ def prepare_shots(
             Shot(
                 verts, view, view.viewmat.to(device), view.K.to(device), view.frame if refined else None,
                 torch.tensor(background, dtype=torch.float32, device=device), truth,
-                torch.from_numpy(alpha >= 128)[None].to(device), features,
+                torch.from_numpy(alpha >= 128)[None].to(device),
+                None if unseen is None else torch.from_numpy(unseen).to(device), features,
             )
         )  # fmt: skip
     return shots
@@ -203,9 +207,10 @@ def difference(image: Tensor, other: Reference, net: LPIPS) -> dict[str, float]:
 def quality(image: Tensor, shot: Shot, net: LPIPS) -> dict[str, float | None]:
     """Metrics of a picture (3, H, W) of a shot against its truth, averaged down to the truth's size."""
     times = image.shape[-1] // shot.truth.shape[-1]
-    return measure(
-        functional.avg_pool2d(_stored(image), times), shot.truth, shot.mask, {"net": net}, {"net": shot.features}
-    )
+    picture = functional.avg_pool2d(_stored(image), times)
+    if shot.unseen is not None:
+        picture = torch.where(shot.unseen, shot.background[:, None, None], picture)
+    return measure(picture, shot.truth, shot.mask, {"net": net}, {"net": shot.features})
 
 
 def _stored(image: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ def test_labels_lie_where_the_meshes_project_with_the_new_camera(prepared, tmp_p
         for row, frame in enumerate(pack.frames):
             label, alpha, rgb = (pack.read(layer, frame) for layer in ("label", "alpha", "rgb"))
             assert label.shape == alpha.shape == rgb.shape[:2] == (size, size)
-            assert ((label > 0) == (alpha > 0)).all()
+            assert (np.isin(label, [1, 2, 3]) == (alpha > 0)).all()
             pixels, _ = project(sequence.parts["right_hand"].verts[row], pack.intrinsics(frame), pack.cam_from_world)
             low, high = pixels.min(0), pixels.max(0)
             rows, columns = np.nonzero(label == 2)
@@ -54,6 +54,22 @@ def test_labels_lie_where_the_meshes_project_with_the_new_camera(prepared, tmp_p
             slack = 1.0 + size / 80
             inside = np.concatenate([np.clip(low, 0, size), np.clip(high, 0, size)])
             assert np.abs(seen - inside).max() < slack
+
+
+def test_what_the_camera_did_not_see_is_marked(prepared, tmp_path):
+    native = FramePack(prepared / "left.zip").manifest
+    for cfg in ({"kind": "full", "size": 0}, {"kind": "center", "size": 64}):
+        assert crop(prepared, tmp_path / f"{cfg['kind']}.zip", **cfg) == 0
+        with FramePack(tmp_path / f"{cfg['kind']}.zip") as pack:
+            x0, y0, side = pack.manifest["record"]["window"]
+            y, x = np.mgrid[y0 : y0 + side, x0 : x0 + side]
+            outside = (x < 0) | (y < 0) | (x >= native["width"]) | (y >= native["height"])
+            assert pack.manifest["unseen"] == outside.any() == (cfg["kind"] == "full")
+            for frame in pack.frames:
+                if outside.any():
+                    np.testing.assert_array_equal(pack.unseen(frame), outside)
+                else:
+                    assert pack.unseen(frame) is None and pack.read("label", frame).max() < 4
 
 
 def test_box_covers_head_and_hand_with_its_margin(prepared, tmp_path):

@@ -6,7 +6,7 @@ import torch
 
 from nbavatar.data.views import ViewStore, ViewStream, shuffled, views_of
 from nbavatar.errors import DataError
-from nbavatar.io.framepack import FramePack
+from nbavatar.io.framepack import UNSEEN, FramePack, FramePackWriter
 from tests.scenes.toy import FRAMES, SIZE, write_scene
 
 PARTS = ["head", "right_hand"]
@@ -52,6 +52,23 @@ def test_sample_shrinks_by_block_means_with_scaled_intrinsics(packs, shrink: int
     np.testing.assert_allclose(_picture(small), blocks, atol=1e-6)
     torch.testing.assert_close(small.K[:2], views[0].K[:2] / shrink)
     assert small.K[2].tolist() == [0, 0, 1]
+
+
+def test_sample_marks_what_the_camera_did_not_see(packs, tmp_path) -> None:
+    """As in a crop that sticks out of the image at the right: coverage 0 there is no statement about the background."""
+    pack = packs[0]
+    with FramePackWriter(tmp_path / "out.zip", {**pack.manifest, "unseen": True}) as out:
+        for frame in pack.frames:
+            label, alpha = pack.read("label", frame).copy(), pack.read("alpha", frame).copy()
+            label[:, 20:], alpha[:, 20:] = UNSEEN, 0
+            for layer, image in (("rgb", pack.read("rgb", frame)), ("label", label), ("alpha", alpha)):
+                out.add(layer, frame, image)
+    with FramePack(tmp_path / "out.zip") as cut:
+        picture = _picture(ViewStore([cut], _views([cut]), PARTS, 10**9).sample(0))
+    before = _picture(ViewStore(packs, _views(packs), PARTS, 10**9).sample(0))
+    assert (picture[4][:, 20:] == 1).all() and (picture[4][:, :20] == 0).all()
+    np.testing.assert_array_equal(picture[:4, :, :20], before[:4, :, :20])
+    assert before[3][:, 20:].any() and not picture[3][:, 20:].any()
 
 
 def test_sample_marks_parts_that_are_not_modelled(packs) -> None:

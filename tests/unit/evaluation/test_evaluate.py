@@ -11,7 +11,7 @@ from skimage.metrics import structural_similarity
 
 from nbavatar.cli import main
 from nbavatar.evaluation.evaluate import composite, mean_images
-from nbavatar.io.framepack import FramePackWriter
+from nbavatar.io.framepack import UNSEEN, FramePackWriter
 
 SIZE = 40
 FRAMES = ["0001", "0002", "0003"]
@@ -31,16 +31,25 @@ def alpha_of(seed: int) -> np.ndarray:
     return alpha
 
 
-def write_crop(path, camera, seed):
+def write_crop(path, camera, seed, unseen=None):
+    """`unseen`: columns of which the camera's image says nothing."""
     manifest = {
         "stage": "crop", "subject": "S2", "camera": camera, "width": SIZE, "height": SIZE, "K": np.eye(3).tolist(),
         "cam_from_world": np.eye(4).tolist(), "distortion": None, "frames": FRAMES, "split": SPLIT,
         "segments": [[0, 2]], "layers": {"rgb": "", "alpha": ""}, "record": {},
     }  # fmt: skip
+    if unseen is not None:
+        manifest |= {"unseen": True, "layers": {"rgb": "", "alpha": "", "label": ""}}
     with FramePackWriter(path, manifest) as pack:
         for i, frame in enumerate(FRAMES):
+            alpha = alpha_of(seed + i)
+            if unseen is not None:
+                alpha[:, unseen] = 0
+                label = np.where(alpha > 0, np.uint8(1), np.uint8(0))
+                label[:, unseen] = UNSEEN
+                pack.add("label", frame, label)
             pack.add("rgb", frame, image(seed + i))
-            pack.add("alpha", frame, alpha_of(seed + i))
+            pack.add("alpha", frame, alpha)
 
 
 def write_render(path, images: dict[str, np.ndarray], record=None):
@@ -69,6 +78,26 @@ def run(files, render, *, frames=("102",), protocol="nv1024", train=("108", "110
 
 
 FAST = ("--cfg", '{"nets": ["alex"], "device": "cpu"}')
+
+
+def test_what_is_rendered_beyond_the_cameras_image_does_not_count(files):
+    """A hand that leaves the picture goes on in the render: there is no truth to hold that against."""
+    unseen = slice(24, SIZE)
+    write_crop(files / "102.zip", "102", 10, unseen=unseen)
+    results = []
+    for seed in (1, 2):
+        picture = image(7)
+        picture[:, unseen] = image(seed)[:, unseen]
+        write_render(files / "render.zip", {"102/0001": picture, "102/0002": picture})
+        assert run(files, files / "render.zip", extra=FAST) == 0
+        results.append(json.loads((files / "eval.json").read_text()))
+    assert results[0]["per_image"] == results[1]["per_image"]
+    blank = image(7)
+    blank[:, unseen] = 255
+    alpha = alpha_of(10)[..., None] / 255.0
+    alpha[:, unseen] = 0
+    error = (alpha * image(10) / 255.0 + 1 - alpha - blank / 255.0) ** 2
+    assert results[0]["per_image"][0]["psnr"] == pytest.approx(-10 * math.log10(error.mean()), rel=1e-6)
 
 
 def test_figures_equal_an_independent_computation(files):

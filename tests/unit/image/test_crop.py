@@ -5,7 +5,7 @@ import skimage.transform
 
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import crop_intrinsics, project, scale_intrinsics
-from nbavatar.image.crop import Window, resize_area, resize_labels
+from nbavatar.image.crop import Window, blank_unseen, resize_area, resize_labels
 
 K = np.array([[400.0, 0, 171.2], [0, 410.0, 118.6], [0, 0, 1]])
 
@@ -50,6 +50,37 @@ def test_window_outside_the_image_is_black():
     expected[5:45, 10:60] = 200
     np.testing.assert_array_equal(cut, expected)
     assert not Window(200, 0, 16, K).cut(image).any()
+
+
+@pytest.mark.parametrize(("size", "first"), [(64, (5, 10)), (32, (3, 5)), (16, (2, 3))])
+def test_what_lies_outside_the_image_is_unseen(size, first):
+    """Of a pixel that is partly outside nothing is known either: 5 of 64 rows are 1.25 of 16."""
+    unseen = Window(-10, -5, 64, K).unseen(70, 50, size)
+    expected = np.ones((size, size), bool)
+    expected[first[0] :, first[1] : 60 * size // 64] = False
+    np.testing.assert_array_equal(unseen, expected)
+    assert not Window(10, 5, 32, K).unseen(70, 50, size).any()
+
+
+@pytest.mark.parametrize("distortion", [[-0.3, 0.1, 0.002, -0.001, 0.0], [0.25, -0.05, 0.0, 0.0, 0.0]])
+def test_an_undistorted_image_is_seen_as_far_as_its_pixels_reach(distortion):
+    """Where each pixel's centre lies in the image as it was taken; two of its pixels are lost to interpolation."""
+    window = Window(-40, -40, 400, K, np.array(distortion))
+    y, x = np.mgrid[-40:360, -40:360] + 0.5
+    native = distort_pixels(np.stack([x, y], -1).reshape(-1, 2), K, np.array(distortion)).reshape(400, 400, 2)
+    inside = np.minimum(native, [340, 240] - native).min(-1)
+    unseen = window.unseen(240, 340, 400)
+    assert unseen[inside < 0].all() and not unseen[inside > 4].any()
+    assert 0.01 < unseen.mean() < 0.9
+
+
+def test_only_what_is_unseen_is_blanked():
+    image = np.full((4, 6, 3), 7, np.uint8)
+    unseen = np.zeros((4, 6), bool)
+    unseen[1] = True
+    blank = blank_unseen(image, unseen, (1.0, 0.5, 0.0))
+    assert (blank[1] == [255, 128, 0]).all() and (np.delete(blank, 1, 0) == 7).all()
+    assert blank_unseen(image, None, (1.0, 0.5, 0.0)) is image
 
 
 def test_undistortion_equals_opencv():
