@@ -28,7 +28,7 @@ import torch
 
 from nbavatar.benchmarks.raster_scene import RasterScene, make_scene
 from nbavatar.errors import DataError, DeviceError
-from nbavatar.raster import render_billboards
+from nbavatar.raster import render_billboards, workspace
 from nbavatar.raster.ordering import canonical_rank, parse_order
 from nbavatar.raster.projection import project_billboards, texture_support
 from nbavatar.raster.reference import BlendSettings, critical_pixels
@@ -148,6 +148,7 @@ def _forget_peak() -> None:
 def measure(scene: RasterScene, order: str, repeats: int) -> dict[str, Any]:
     """Times of the forward and the backward pass, and what they blend and take."""
     device = scene.means.device.type
+    workspace.release()  # what earlier scenes have left would hide this one's memory
     _forget_peak()
     before = _memory_mb("VmRSS")
     with torch.no_grad():

@@ -12,7 +12,7 @@ import threading
 import numpy as np
 import torch
 
-__all__ = ["empty"]
+__all__ = ["empty", "release"]
 
 _SMALL = 1 << 20  # bytes; the allocator itself keeps smaller blocks
 _KEPT = 1 << 29  # bytes in blocks that nothing uses
@@ -35,6 +35,14 @@ def empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     with _LOCK:
         block = _take(size)
     return block[:size].view(dtype).reshape(shape)
+
+
+def release() -> None:
+    """Gives the blocks that nothing uses back to the system."""
+    with _LOCK:
+        for block in reversed(range(len(_BLOCKS))):
+            if _unused(block):
+                del _BLOCKS[block]
 
 
 def _take(size: int) -> np.ndarray:

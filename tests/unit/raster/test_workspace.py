@@ -26,6 +26,16 @@ def test_memory_comes_back_once_nothing_refers_to_it(monkeypatch):
     assert place % 64 == 0
 
 
+def test_released_blocks_are_those_that_nothing_uses(monkeypatch):
+    monkeypatch.setattr(workspace, "_BLOCKS", [])
+    used = [workspace.empty((factor * SIZE,), np.dtype(np.uint8)) for factor in (1, 5, 3)]
+    used[1][:] = 7
+    del used[2], used[0]
+    workspace.release()
+    assert [block.nbytes for block in workspace._BLOCKS] == [5 * SIZE]
+    assert (used[0] == 7).all()
+
+
 def test_blocks_that_nothing_uses_are_bounded(monkeypatch):
     monkeypatch.setattr(workspace, "_BLOCKS", [])
     monkeypatch.setattr(workspace, "_KEPT", 10 * SIZE)
