@@ -118,8 +118,9 @@ def _build(replay):
                         put(k.through, y * TILE_WIDTH + x, one)
                         put(k.floor, y * TILE_WIDTH + x, numbers.none)
                 if replay:
+                    put(k.length, 0, 0)
                     for i in range(plane):
-                        put(k.last, i, -1)
+                        put(k.behind, i, zero)
                 else:
                     for i in range(pixels * stride):
                         put(k.sums, i, zero)
@@ -136,7 +137,7 @@ def _build(replay):
                         reach = get(record, i * RECORD + 11)
                     if level > 0 and (final or (queue < 0 and (level == capacity or waiting >= patience))):
                         full = level == capacity
-                        level, stay, finished = drain(scene, k, replay, reach, pixels, noted)
+                        level, stay, finished = drain(scene, k, replay, reach, pixels)
                         active -= finished
                         # As many must come as have stayed, so that the sorting stays in proportion.
                         waiting, patience = 0, max(_PATIENCE, stay)
@@ -177,17 +178,17 @@ def _build(replay):
                         level = max(level, append(k, hits, bundles))
                         waiting += hits
                     elif queue > 0:
-                        active -= pass_through(scene, k, replay, hits, bundles, queue, noted)
+                        active -= pass_through(scene, k, replay, hits, bundles, queue)
                         level = queue
                     else:
-                        active -= blend_at_once(scene, k, replay, count, hits, features, bundles, noted)
+                        active -= blend_at_once(scene, k, replay, count, hits, features, bundles)
                     bundles += more
                 if overflow:
                     break
                 noted += bundles
                 total += bundles
                 if replay:
-                    settle(scene, k, left, right, top, bottom, noted - bundles)
+                    settle(scene, k, noted - bundles)
                 else:
                     write(scene, k, image, opacity, left, right, top, bottom, width, height)
             if overflow:

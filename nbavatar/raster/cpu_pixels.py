@@ -78,21 +78,20 @@ def keep_worth(scene, k, hits, bundles, left, top, width):
 
 
 @inlined
-def note(scene, k, pixel, number, through, noted):
-    """Notes that a hit has been blended at a pixel of the band which this much light reaches: replay."""
-    at = 2 * LANES * (noted + (number >> SHIFT)) + (number & LANE)
-    put(scene.notes, at, through)
-    put(scene.notes, at + LANES, get(k.worth, number))
-    put(k.before, number, get(k.last, pixel))
-    put(k.last, pixel, number)
+def _note(k, at, pixel, number, through):
+    """Notes as the band's hit `at` to be blended that this one was, at a pixel which so much light reaches: replay."""
+    put(k.blended, at, number)
+    put(k.pixel, at, pixel)
+    put(k.light, at, through)
 
 
 @inlined
-def blend_one(scene, k, replay, pixel, number, through, opacity, noted):
+def blend_one(scene, k, replay, pixel, number, through, opacity):
     """Blends a hit that has waited at a pixel of the band which the light `through` reaches."""
     put(scene.status, 2, get(scene.status, 2) + 1)
     if replay:
-        note(scene, k, pixel, number, through, noted)
+        _note(k, get(k.length, 0), pixel, number, through)
+        put(k.length, 0, get(k.length, 0) + 1)
     else:
         stride = scene.layout.stride
         share, sums, row = spread(through * opacity), ahead(k.sums, pixel * stride), ahead(k.features, number * stride)
@@ -109,23 +108,25 @@ def _add_rows(k, first, stride, c):
 
 
 @inlined
-def blend(scene, k, replay, now, first, through, share, ids, noted):
+def blend(scene, k, replay, now, first, through, share, ids):
     """Blends one hit at each of the pixels `first + lane` in the mask `now`, or, in the replay, notes it.
 
     Args:
         first: place of lane 0 in the band.
         through: transmittance in front of the hits; `share`: it times their opacity; `ids`: their numbers.
-        noted: place of the band's first bundle among the notes.
     """
     word = bits(now)
     put(scene.status, 2, get(scene.status, 2) + count_bits(word))
     if replay:
         store(k.whole, 0, ids)
         store(k.row, 0, through)
+        at = np.int64(get(k.length, 0))
+        put(k.length, 0, at + count_bits(word))
         while word != 0:
             lane = count_trailing_zeros(word)
             word &= word - 1
-            note(scene, k, first + lane, np.int64(get(k.whole, lane)), get(k.row, lane), noted)
+            _note(k, at, first + lane, get(k.whole, lane), get(k.row, lane))
+            at += 1
     else:  # other lanes add a row of zeros
         store(k.whole, 0, choose(now, ids, spread(np.int32(scene.room))))
         store(k.row, 0, choose(now, share, scene.limits.zero))
@@ -137,7 +138,7 @@ def blend(scene, k, replay, now, first, through, share, ids, noted):
 
 
 @inlined
-def blend_at_once(scene, k, replay, count, hits, features, bundles, noted):
+def blend_at_once(scene, k, replay, count, hits, features, bundles):
     """Blends the hits of the billboard in hand; returns the number of pixels that this has finished.
 
     Args:
@@ -155,9 +156,11 @@ def blend_at_once(scene, k, replay, count, hits, features, bundles, noted):
         finished += closed
     put(scene.status, 2, get(scene.status, 2) + hits)
     if replay:
+        at = np.int64(get(k.length, 0))
+        put(k.length, 0, at + hits)
         for h in range(hits):
             through = get(groups.share, np.int64(get(groups.hit, h)))
-            note(scene, k, np.int64(get(groups.spot, h)), bundles * LANES + h, through, noted)
+            _note(k, at + h, get(groups.spot, h), bundles * LANES + h, through)
     else:
         _add(scene, k, hits, features)
     return finished
@@ -217,17 +220,17 @@ def write(scene, k, image, opacity, left, right, top, bottom, width, height):
 
 
 @inlined
-def settle(scene, k, left, right, top, bottom, noted):
-    """Turns a band's notes (T and the worth of a hit) into T a and the gradient by a, from back to front."""
-    zero, one = scene.numbers.zero, scene.numbers.one
-    for y in range(bottom - top):
-        for x in range(right - left):
-            number = np.int64(get(k.last, y * TILE_WIDTH + x))
-            behind = zero
-            while number >= 0:
-                note = 2 * LANES * (noted + (number >> SHIFT)) + (number & LANE)
-                through, worth, a = get(scene.notes, note), get(scene.notes, note + LANES), get(k.opacity, number)
-                put(scene.notes, note, through * a)
-                put(scene.notes, note + LANES, through * (worth - behind))
-                behind = a * worth + (one - a) * behind
-                number = np.int64(get(k.before, number))
+def settle(scene, k, noted):
+    """Writes T a and the gradient by a of the band's blended hits, from the last to the first.
+
+    Args:
+        noted: place of the band's first bundle among the notes.
+    """
+    one = scene.numbers.one
+    for at in range(np.int64(get(k.length, 0)) - 1, -1, -1):
+        number, pixel, through = np.int64(get(k.blended, at)), np.int64(get(k.pixel, at)), get(k.light, at)
+        worth, a, behind = get(k.worth, number), get(k.opacity, number), get(k.behind, pixel)
+        note = 2 * LANES * (noted + (number >> SHIFT)) + (number & LANE)
+        put(scene.notes, note, through * a)
+        put(scene.notes, note + LANES, through * (worth - behind))
+        put(k.behind, pixel, a * worth + (one - a) * behind)

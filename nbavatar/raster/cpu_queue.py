@@ -79,11 +79,11 @@ def _nearest(k, pixel, length):
 
 
 @inlined
-def pass_through(scene, k, replay, hits, bundles, length, noted):
+def pass_through(scene, k, replay, hits, bundles, length):
     """Puts hits behind queues of a fixed length; where one gets longer, its nearest hit is blended.
 
     Args:
-        bundles: of hits that the band had before; noted: place of the first of them among the notes.
+        bundles: of hits that the band had before.
 
     Returns:
         Number of pixels that this has finished.
@@ -97,7 +97,7 @@ def pass_through(scene, k, replay, hits, bundles, length, noted):
             continue
         last, nearest = count * plane + pixel, _nearest(k, pixel, length + 1)
         through, opacity = get(k.through, pixel), get(k.queues.opacities, nearest)
-        blend_one(scene, k, replay, pixel, np.int64(get(k.queues.ids, nearest)), through, opacity, noted)
+        blend_one(scene, k, replay, pixel, np.int64(get(k.queues.ids, nearest)), through, opacity)
         put(k.queues.keys, nearest, get(k.queues.keys, last))
         put(k.queues.opacities, nearest, get(k.queues.opacities, last))
         put(k.queues.ids, nearest, get(k.queues.ids, last))
@@ -152,7 +152,7 @@ def _sort(scene, k, first, count, most):
 
 
 @inlined
-def drain(scene, k, replay, reach, pixels, noted):
+def drain(scene, k, replay, reach, pixels):
     """Blends all hits at least as near as `reach`; sorts the queues on the way.
 
     What waits tells from which key on hits can be ignored: where so little light comes through it that they would
@@ -183,7 +183,7 @@ def drain(scene, k, replay, reach, pixels, noted):
             some, final = key > none, key >= near
             now = some & final & (through >= t_min)
             if any_lane(now):
-                blend(scene, k, replay, now, first, through, through * opacity, ids, noted)
+                blend(scene, k, replay, now, first, through, through * opacity, ids)
                 through = choose(now, through * (one - opacity), through)
             behind = choose(some, behind * (one - opacity), behind)
             held = held + truths(some)

@@ -56,13 +56,17 @@ class Scratch(NamedTuple):
     through: Any  # transmittance
     floor: Any  # hits with a smaller key than this are of no use to the pixel
     sums: Any  # blended features, `stride` a pixel
-    last: Any  # replay: the hit blended last
+    behind: Any  # replay: what a pixel's light is worth behind the hits settled so far
     # of the band's hits
     rank: Any  # of each bundle's billboard
     features: Any  # `stride` a hit, and a row of zeros behind them; replay: of the billboard in hand
     opacity: Any  # replay
     worth: Any  # replay: what a hit's share of its pixel changes
-    before: Any  # replay: the hit blended before it at its pixel, or -1
+    # of those that have been blended, in that order: replay
+    blended: Any  # number
+    pixel: Any  # place in the band
+    light: Any  # transmittance in front of it
+    length: Any  # how many they are: one number
     # room for a row of numbers
     row: Any
     whole: Any
@@ -96,10 +100,10 @@ def scratch_sizes(rows: int, capacity: int, channels: int, bundles: int, replay:
     plane = TILE_WIDTH * rows + LANES
     stride = -(-channels // LANES) * LANES
     hits, slots = bundles * LANES, max(capacity, LONGEST)
-    features = PART * stride + 2 * hits if replay else (hits + 1) * stride
+    features = PART * stride + 3 * hits + plane if replay else (hits + 1) * stride
     reals = plane * (2 + stride + 2 * slots) + features + 7 * PART + LANES
     wholes = plane * (1 + slots) + bundles + 2 * TILE_HEIGHT + 2 * _GROUPS + 3 * PART + LANES
-    return reals, wholes + (hits + plane if replay else 0)
+    return reals, wholes + (2 * hits + 1 if replay else 0)
 
 
 @inlined
@@ -113,23 +117,27 @@ def divide(real, whole, plane, stride, capacity, bundles, replay):
     features = row + LANES
     opacity = features + PART * stride
     worth = opacity + hits
+    light = worth + hits
+    behind = light + hits
     ids = plane
     rank = ids + slots * plane
     ends = rank + bundles
     first = ends + 2 * TILE_HEIGHT
     rest, cell = first + _GROUPS, first + 2 * _GROUPS
     hit, spot, line = cell + PART, cell + 2 * PART, cell + 3 * PART
-    last = line + LANES
-    before = last + plane
+    blended = line + LANES
+    pixel = blended + hits
+    length = pixel + hits
     if not replay:  # not used, and no room
-        opacity, worth, last, before = 0, 0, 0, 0
+        opacity, worth, light, behind, blended, pixel, length = 0, 0, 0, 0, 0, 0, 0
     groups = Groups(
         pointer(whole, ends), pointer(whole, first), pointer(whole, rest), pointer(real, key), pointer(whole, cell),
         pointer(real, weights), pointer(real, alpha), pointer(real, share), pointer(whole, hit), pointer(whole, spot),
     )  # fmt: skip
     queues = Queues(pointer(real, keys), pointer(real, opacities), pointer(whole, ids), pointer(whole, 0), plane)
     return Scratch(
-        groups, queues, pointer(real, 0), pointer(real, floor), pointer(real, sums), pointer(whole, last),
+        groups, queues, pointer(real, 0), pointer(real, floor), pointer(real, sums), pointer(real, behind),
         pointer(whole, rank), pointer(real, features), pointer(real, opacity), pointer(real, worth),
-        pointer(whole, before), pointer(real, row), pointer(whole, line),
+        pointer(whole, blended), pointer(whole, pixel), pointer(real, light), pointer(whole, length),
+        pointer(real, row), pointer(whole, line),
     )  # fmt: skip
