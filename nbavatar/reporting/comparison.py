@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from nbavatar.image.crop import blank_unseen
-from nbavatar.io.framepack import FramePack
+from nbavatar.io.framepack import UNSEEN, FramePack
 from nbavatar.reporting.insets import contact_pixels, contact_window, cut
 from nbavatar.reporting.page import Card, Strip
 from nbavatar.reporting.pictures import data_uri, error_map, reduce_picture, spread
@@ -129,9 +129,11 @@ def compare_frame(name: str, group: Sequence[Rendered], crops: Sequence[FramePac
     columns = []
     crop = find_truth(group[0].pack, name, crops)
     if crop is not None:
-        alpha, unseen = crop.read("alpha", frame), crop.unseen(frame)
+        alpha = crop.read("alpha", frame)
+        label = crop.read("label", frame) if "label" in crop.layers else None
+        unseen = None if label is None else label == UNSEEN
         truth = _composite(crop.read("rgb", frame), alpha, group[0].background)
-        window = contact_window(crop.read("label", frame) if "label" in crop.layers else None, alpha)
+        window = contact_window(label, alpha)
         picture = np.round(truth * 255).astype(np.uint8)
         columns.append(Column("Ground truth", {"whole": picture, "zoom": cut(picture, window), "coverage": alpha}, {}))
     for render in group:
