@@ -26,7 +26,7 @@ import numpy as np
 
 from nbavatar.errors import DataError
 
-__all__ = ["read_array", "read_pickle"]
+__all__ = ["parse_pickle", "read_array", "read_pickle"]
 
 _ERRORS = (
     pickle.UnpicklingError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError, MemoryError,
@@ -344,6 +344,19 @@ def read_pickle(path: Path | str) -> Any:
     path, stream = _open(path)
     with stream:
         return _load(stream, path)
+
+
+def parse_pickle(content: bytes, path: Path | str) -> Any:
+    """Parses a pickle that has been read already, as `read_pickle` does; for files whose digest is checked first.
+
+    Args:
+        content: the whole file.
+        path: where it is from; used in error lines only.
+
+    Raises:
+        DataError: the content is damaged, or names anything outside the allow-list (the name is said).
+    """
+    return _load(io.BytesIO(content), Path(path))
 
 
 def read_array(path: Path | str) -> Any:

