@@ -90,7 +90,8 @@ def read_sequence(path: str | os.PathLike[str]) -> tuple[MeshSequence, dict[str,
     """Reads a sequence and its record.
 
     Raises:
-        DataError: missing, damaged, no part at all, or shapes that disagree.
+        DataError: missing, damaged, no part at all, shapes that disagree, faces that are no whole numbers, vertices
+            that are no finite real numbers (a part that is not in a frame is NaN there, all of it).
     """
     arrays, record = read_arrays(path, required=("frames",))
     _check(str(path), arrays)
@@ -105,7 +106,11 @@ def read_sequence(path: str | os.PathLike[str]) -> tuple[MeshSequence, dict[str,
 
 
 def _check(path: str, arrays: Mapping[str, np.ndarray]) -> None:
-    count = len(arrays["frames"])
+    names = arrays["frames"]
+    if names.ndim != 1 or names.dtype.kind != "U" or not len(names):
+        raise DataError.of(path, "frames", expected="frame ids, text [N]", found=_kind(names))
+    if len(np.unique(names)) != len(names):
+        raise DataError.of(path, "frames", expected="each frame once", found="one twice")
     present = [name for name in PARTS if f"{name}.verts" in arrays]
     if not present:
         raise DataError.of(path, expected=f"at least one part of {', '.join(PARTS)}", found="none")
@@ -113,12 +118,37 @@ def _check(path: str, arrays: Mapping[str, np.ndarray]) -> None:
         for key in ("faces", "rest"):
             if f"{name}.{key}" not in arrays:
                 raise DataError.of(path, f"{name}.{key}", expected="this array", found="none")
-        faces, rest, verts = (arrays[f"{name}.{key}"] for key in ("faces", "rest", "verts"))
-        if verts.shape != (count, *rest.shape) or rest.ndim != 2 or rest.shape[1] != 3:
-            expected = f"[{count}, V, 3] with V of the rest shape {list(rest.shape)}"
-            raise DataError.of(path, f"{name}.verts", expected=expected, found=list(verts.shape))
-        if faces.ndim != 2 or faces.shape[1:] != (3,):
-            raise DataError.of(path, f"{name}.faces", expected="[F, 3]", found=list(faces.shape))
-        if faces.size and (faces.min() < 0 or faces.max() >= len(rest)):
-            expected = f"vertex ids from 0 to {len(rest) - 1}"
-            raise DataError.of(path, f"{name}.faces", expected=expected, found=f"{faces.min()} to {faces.max()}")
+        _check_part(path, name, *(arrays[f"{name}.{key}"] for key in ("faces", "rest", "verts")), len(names))
+
+
+def _check_part(path: str, name: str, faces: np.ndarray, rest: np.ndarray, verts: np.ndarray, count: int) -> None:
+    for key, array, kinds, expected in (
+        ("faces", faces, "iu", "whole numbers [F, 3]"),
+        ("rest", rest, "f", "real numbers [V, 3]"),
+        ("verts", verts, "f", "real numbers [N, V, 3]"),
+    ):
+        if array.dtype.kind not in kinds:
+            raise DataError.of(path, f"{name}.{key}", expected=expected, found=_kind(array))
+    if verts.shape != (count, *rest.shape) or rest.ndim != 2 or rest.shape[1] != 3:
+        expected = f"[{count}, V, 3] with V of the rest shape {list(rest.shape)}"
+        raise DataError.of(path, f"{name}.verts", expected=expected, found=list(verts.shape))
+    if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
+        raise DataError.of(path, f"{name}.faces", expected="[F, 3] with at least one face", found=list(faces.shape))
+    if faces.min() < 0 or faces.max() >= len(rest):
+        expected = f"vertex ids from 0 to {len(rest) - 1}"
+        raise DataError.of(path, f"{name}.faces", expected=expected, found=f"{faces.min()} to {faces.max()}")
+    if not np.isfinite(rest).all():
+        bad = int(np.flatnonzero(~np.isfinite(rest).all(axis=1))[0])
+        raise DataError.of(path, f"{name}.rest", expected="finite numbers", found=f"NaN or infinity at vertex {bad}")
+    # A part that is not in a frame is NaN there, all of it.
+    finite = np.isfinite(verts).reshape(count, -1)
+    broken = np.flatnonzero(~(finite.all(axis=1) | np.isnan(verts).reshape(count, -1).all(axis=1)))
+    if len(broken):
+        frame, vertex = int(broken[0]), int(np.flatnonzero(~finite[broken[0]])[0]) // 3
+        found = f"NaN or infinity at frame {frame}, vertex {vertex}"
+        expected = "finite numbers, or NaN at all vertices of a frame without the part"
+        raise DataError.of(path, f"{name}.verts", expected=expected, found=found)
+
+
+def _kind(array: np.ndarray) -> str:
+    return f"{array.dtype} {list(array.shape)}"

@@ -3,6 +3,7 @@ import pytest
 
 from nbavatar.data.sequences import MeshSequence, Part, read_sequence, write_sequence
 from nbavatar.errors import DataError
+from nbavatar.io.arrays import read_arrays, write_arrays
 
 
 def _sequence(rng, frames=("a", "b", "c")):
@@ -56,3 +57,37 @@ def test_write_refuses_shapes_that_disagree(tmp_path, faces, verts, match):
 def test_sequence_without_any_part_is_refused(tmp_path):
     with pytest.raises(DataError, match="at least one part"):
         write_sequence(tmp_path / "s.npz", MeshSequence(["a"], {}), {})
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "line"),
+    [
+        ("head.faces", lambda a: a + 0.5, r"head.faces: expected whole numbers \[F, 3\], found float64 \[2, 3\]"),
+        ("head.faces", lambda a: a[:0], r"head.faces: expected \[F, 3\] with at least one face, found \[0, 3\]"),
+        ("head.verts", lambda a: a.astype(complex), "head.verts: expected real numbers .* found complex128"),
+        ("head.rest", lambda a: a.astype(str), "head.rest: expected real numbers .* found <U"),
+        ("head.rest", lambda a: np.where(np.arange(4)[:, None] == 2, np.nan, a), "NaN or infinity at vertex 2"),
+        (
+            "head.verts",
+            lambda a: np.where(np.arange(4)[:, None] == 3, np.inf, a),
+            "NaN or infinity at frame 0, vertex 3",
+        ),
+        ("frames", lambda a: np.arange(3), "frames: expected frame ids, text"),
+        ("frames", lambda a: np.array(["a", "b", "a"]), "frames: expected each frame once"),
+    ],
+)
+def test_arrays_that_are_no_meshes_are_refused_when_they_are_read(tmp_path, rng, name, change, line):
+    write_sequence(tmp_path / "s.npz", _sequence(rng), {})
+    arrays, record = read_arrays(tmp_path / "s.npz")
+    write_arrays(tmp_path / "s.npz", {**arrays, name: change(arrays[name])}, record)
+    with pytest.raises(DataError, match=line) as error:
+        read_sequence(tmp_path / "s.npz")
+    assert "s.npz" in str(error.value)
+
+
+def test_a_part_that_is_not_in_a_frame_is_nan_there(tmp_path, rng):
+    sequence = _sequence(rng)
+    sequence.parts["head"].verts[1] = np.nan
+    write_sequence(tmp_path / "s.npz", sequence, {})
+    verts = read_sequence(tmp_path / "s.npz")[0].parts["head"].verts
+    assert np.isnan(verts[1]).all() and np.isfinite(verts[[0, 2]]).all()

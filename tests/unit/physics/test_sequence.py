@@ -122,7 +122,7 @@ def _write(path, clip, **extras):
 
 def test_verb_writes_sequence_maps_and_picture(tmp_path, clip, capsys):
     broken = clip[0].copy()
-    broken[7, 0] = np.nan
+    broken[7] = np.nan  # the head is not in this frame
     reference = np.zeros_like(clip[0])
     _write(tmp_path / "in.npz", (broken, clip[1]), **{"deformation.head": reference, "segments": np.array([[0, 7]])})
     arguments = ["deform", "--meshes", str(tmp_path / "in.npz"), "--out", str(tmp_path / "out.npz")]
