@@ -78,7 +78,10 @@ class RunConfig:
     data_root: str = option("resources/DecafDataset", "Folder of the dataset, or of one capture, or of captures.")
     synthetic: bool = option(False, "Make the dataset at `data_root` with `nbavatar synthesize` first.")
     subjects: str = option("config/subjects.tsv", "Sheet of subjects and cameras; not used by the capture layout.")
-    test_camera: str = option("", "Capture layout: camera to hold out; empty for the one best surrounded by others.")
+    test_camera: str | int = option(
+        "",
+        "Capture layout: camera to hold out (084 and 84 mean the same); empty for the one best surrounded by others.",
+    )
     runs: str = option("config/runs.tsv", "Sheet of what to make: subject, variant, protocol.")
     tables: str = option("config/tables.yaml", "Layout of the tables.")
     reported: str = option("config/reported.csv", "Numbers printed in the paper.")

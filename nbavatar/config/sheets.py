@@ -11,7 +11,8 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from nbavatar.errors import ConfigError, did_you_mean
+from nbavatar.config.cameras import choose_camera, parse_camera, read_rig
+from nbavatar.errors import ConfigError, DataError, did_you_mean
 
 __all__ = ["Row", "Subject", "capture_subjects", "read_rows", "read_subjects"]
 
@@ -67,16 +68,14 @@ def read_subjects(path: str | os.PathLike[str], root: str) -> dict[str, Subject]
     return subjects
 
 
-def capture_subjects(root: str, test_camera: str) -> dict[str, Subject]:
+def capture_subjects(root: str, test_camera: str | int) -> dict[str, Subject]:
     """Finds captures: `root` itself if it holds `cameras.json`, else its sub-folders that do.
 
     Args:
         root: folder of one capture, or of several.
-        test_camera: camera to hold out; empty for the one whose two nearest neighbours are nearest (by the farther of
-            the two), so that the judged view lies between training views.
+        test_camera: camera to hold out (a number where its id is one); empty for the one whose two nearest neighbours
+            are nearest (by the farther of the two), so that the judged view lies between training views.
     """
-    import json
-
     base = Path(root)
     folders = [base] if (base / "cameras.json").is_file() else sorted(base.glob("*/cameras.json"))
     folders = [folder.parent if folder.name == "cameras.json" else folder for folder in folders]
@@ -90,15 +89,13 @@ def capture_subjects(root: str, test_camera: str) -> dict[str, Subject]:
     for folder in folders:
         path = folder / "cameras.json"
         try:
-            cameras = json.loads(path.read_text(encoding="utf-8"))
-            centres = {name: _centre(camera["R"], camera["t"]) for name, camera in cameras.items()}
-        except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-            raise ConfigError.of(path, expected="camera name -> width, height, K, R, t", found=repr(error)) from error
+            rig = {name: parse_camera(name, entry, path) for name, entry in read_rig(path).items()}
+        except DataError as error:
+            raise ConfigError(str(error)) from error
+        centres = {name: camera.centre for name, camera in rig.items()}
         if len(centres) < 2:
             raise ConfigError.of(path, expected="two cameras or more", found=len(centres))
-        held_out = test_camera or _best_surrounded(centres)
-        if held_out not in centres:
-            raise ConfigError(f"test_camera: unknown camera '{held_out}'; {did_you_mean(held_out, centres)}")
+        held_out = _best_surrounded(centres) if test_camera == "" else choose_camera(test_camera, rig, "test_camera")
         train = tuple(sorted(set(centres) - {held_out}))
         name = re.sub(r"[^A-Za-z0-9_.-]", "_", folder.resolve().name)
         subjects[name] = Subject(name, train, held_out, str(folder))
@@ -126,7 +123,7 @@ def read_rows(path: str | os.PathLike[str], subjects: Sequence[str]) -> list[Row
 
 def _read(path: str | os.PathLike[str], columns: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
     try:
-        with open(path, newline="", encoding="utf-8") as stream:
+        with open(path, newline="", encoding="utf-8-sig") as stream:
             lines = [line for line in stream if not line.startswith("#")]
     except FileNotFoundError as error:
         raise ConfigError.of(path, expected="a sheet (.tsv)", found="no such file") from error
@@ -147,7 +144,3 @@ def _best_surrounded(centres: Mapping[str, Sequence[float]]) -> str:
         return sorted(math.dist(centres[name], other) for other in centres.values())[:3][-1]
 
     return min(sorted(centres), key=second_nearest)
-
-
-def _centre(rotation: Sequence[Sequence[float]], translation: Sequence[float]) -> list[float]:
-    return [-sum(rotation[row][axis] * translation[row] for row in range(3)) for axis in range(3)]

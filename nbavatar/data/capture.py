@@ -20,8 +20,10 @@ import numpy as np
 
 from nbavatar.camera.distortion import checked_coefficients
 from nbavatar.camera.pinhole import Camera
+from nbavatar.config.cameras import parse_camera, read_rig
 from nbavatar.data.sequences import PARTS
-from nbavatar.errors import DataError, did_you_mean
+from nbavatar.data.splits import segments_of
+from nbavatar.errors import DataError, describe, did_you_mean
 from nbavatar.io.arrays import read_arrays
 from nbavatar.io.images import decode_image
 from nbavatar.io.records import read_json
@@ -29,9 +31,9 @@ from nbavatar.io.records import read_json
 __all__ = [
     "Capture",
     "Splits",
+    "camera_of",
     "find_image",
     "open_capture",
-    "parse_camera",
     "read_coverage",
     "read_mask",
     "read_mesh",
@@ -40,6 +42,7 @@ __all__ = [
     "read_topology",
 ]
 
+_SPLITS = ("frames", "train", "test", "cuts")
 _TYPES = (".jpg", ".jpeg", ".png", ".webp")
 
 
@@ -64,17 +67,17 @@ class Capture:
 
 @dataclasses.dataclass(frozen=True)
 class Splits:
-    """Frames in time order, the user's split if there is one, and cuts.
+    """Frames in time order, the user's split if there is one, and uncut runs.
 
     Attributes:
         frames: ids.
         test: ids held out; empty where the user leaves the choice to us.
-        cuts: pairs (last id before, first id after).
+        segments: first and last position in `frames` of each uncut run, inclusive.
     """
 
     frames: list[str]
     test: list[str]
-    cuts: list[tuple[str, str]]
+    segments: list[tuple[int, int]]
 
 
 def open_capture(root: str | Path, *, pixel_center: float = 0.5) -> Capture:
@@ -86,18 +89,24 @@ def open_capture(root: str | Path, *, pixel_center: float = 0.5) -> Capture:
     """
     root = Path(root)
     path = root / "cameras.json"
-    stored = read_json(path)
-    if not isinstance(stored, Mapping) or not stored:
-        raise DataError.of(path, expected="a mapping from camera name to its calibration", found=type(stored).__name__)
-    return Capture(root, {str(n): parse_camera(str(n), entry, path, pixel_center) for n, entry in stored.items()})
+    return Capture(root, {name: camera_of(name, entry, path, pixel_center) for name, entry in read_rig(path).items()})
 
 
 def read_splits(root: Path) -> Splits:
-    """Reads `splits.json`; a `train` list leaves out frames that are in neither list."""
+    """Reads `splits.json`; a `train` list leaves out frames that are in neither list.
+
+    Cuts are between frames of the whole list, whether they are used or not.
+
+    Raises:
+        DataError: damaged, an unknown key, ids that repeat or are not in `frames`, or cuts that are out of order.
+    """
     path = root / "splits.json"
     stored = read_json(path)
     if not isinstance(stored, Mapping):
         raise DataError.of(path, expected="a mapping with frames", found=type(stored).__name__)
+    for key in stored:
+        if key not in _SPLITS:
+            raise DataError(f"{path}: unknown key '{key}'; {did_you_mean(str(key), _SPLITS)}")
     frames = _ids(stored, "frames", path)
     if not frames:
         raise DataError.of(path, "frames", expected="at least one frame id", found="none")
@@ -111,13 +120,27 @@ def read_splits(root: Path) -> Splits:
         raise DataError.of(
             path, "test", expected="frames that are not in train", found=f"'{both[0]}', which is in both"
         )
-    if train:
-        used = set(train) | set(test)
-        frames = [frame for frame in frames if frame in used]
+    runs = segments_of(frames, _cuts(stored, frames, path), str(path))
+    chosen = {*train, *test}
+    used = [not train or frame in chosen for frame in frames]
+    place = np.concatenate([[0], np.cumsum(used)])
+    kept = [(int(place[first]), int(place[last + 1]) - 1) for first, last in runs]
+    return Splits(
+        [frame for frame, there in zip(frames, used) if there], test, [run for run in kept if run[0] <= run[1]]
+    )
+
+
+def _cuts(stored: Mapping[str, Any], frames: Sequence[str], path: Path) -> list[tuple[str, str]]:
     cuts = stored.get("cuts", [])
     if not isinstance(cuts, list) or not all(isinstance(c, list) and len(c) == 2 for c in cuts):
-        raise DataError.of(path, "cuts", expected="pairs of frame ids", found=repr(cuts)[:60])
-    return Splits(frames, test, [(str(a), str(b)) for a, b in cuts])
+        raise DataError.of(path, "cuts", expected="pairs of frame ids", found=describe(cuts))
+    pairs, known = [(str(a), str(b)) for a, b in cuts], set(frames)
+    for frame in (frame for pair in pairs for frame in pair):
+        if frame not in known:
+            raise DataError.of(
+                path, "cuts", expected="pairs of ids that are in frames", found=f"'{frame}', which is not"
+            )
+    return pairs
 
 
 def find_image(root: Path, kind: str, camera: str, frame: str) -> Path | None:
@@ -207,46 +230,17 @@ def read_mesh(
     return result
 
 
-def parse_camera(name: str, entry: Any, path: Path, pixel_center: float = 0.5) -> Camera:
-    """Checks one entry of `cameras.json`; `path` is named in errors."""
-    where = f"{path}: camera {name}"
-    if not isinstance(entry, Mapping):
-        raise DataError.of(where, expected="width, height, K, R, t", found=type(entry).__name__)
-    for key in ("width", "height", "K", "R", "t"):
-        if key not in entry:
-            raise DataError.of(where, key, expected="this key", found=f"only {', '.join(map(str, entry))}")
-    for key in ("width", "height"):
-        if not isinstance(entry[key], int) or isinstance(entry[key], bool) or entry[key] < 1:
-            raise DataError.of(where, key, expected="a whole number of pixels", found=repr(entry[key]))
-    K, R, t = (_numbers(entry[key], shape, where, key) for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))))
-    if np.abs(K[2] - [0, 0, 1]).max() > 1e-9 or K[1, 0] != 0 or K[0, 1] != 0 or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise DataError.of(where, "K", expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", found=K.tolist())
-    off = np.abs(R @ R.T - np.eye(3)).max()
-    if off > 1e-3 or np.linalg.det(R) < 0:
-        found = f"a matrix that is off by {off:.2g}, determinant {np.linalg.det(R):.3g}"
-        raise DataError.of(where, "R", expected="a rotation", found=found)
+def camera_of(name: str, entry: Any, path: Path, pixel_center: float = 0.5) -> Camera:
+    """The camera of one entry of `cameras.json`; `path` is named in errors, see `config.cameras.parse_camera`."""
+    stored, where = parse_camera(name, entry, path), f"{path}: camera {name}"
+    K, pose = np.array(stored.K), np.eye(4)
     K[:2, 2] += 0.5 - pixel_center
-    if not (0 < K[0, 2] < entry["width"] and 0 < K[1, 2] < entry["height"]):
-        expected = f"a principal point inside {entry['width']} x {entry['height']}"
+    if not (0 < K[0, 2] < stored.width and 0 < K[1, 2] < stored.height):
+        expected = f"a principal point inside {stored.width} x {stored.height}"
         raise DataError.of(where, "K", expected=expected, found=f"({K[0, 2]:.1f}, {K[1, 2]:.1f})")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = R, t
-    stored = entry.get("distortion")
-    distortion = None if stored is None else checked_coefficients(stored, f"{where}: distortion")
-    return Camera(name, entry["width"], entry["height"], K, pose, distortion)
-
-
-def _numbers(value: Any, shape: Sequence[int], where: str, key: str) -> np.ndarray:
-    expected = " x ".join(map(str, shape)) + " finite numbers"
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise DataError.of(where, key, expected=expected, found=repr(value)[:60]) from None
-    if key == "t" and array.shape == (3, 1):
-        array = array[:, 0]
-    if array.shape != tuple(shape) or not np.isfinite(array).all():
-        raise DataError.of(where, key, expected=expected, found=f"{list(array.shape)}: {value!r}"[:100])
-    return array
+    pose[:3, :3], pose[:3, 3] = stored.R, stored.t
+    lens = None if stored.distortion is None else checked_coefficients(stored.distortion, f"{where}: distortion")
+    return Camera(name, stored.width, stored.height, K, pose, lens)
 
 
 def _ids(stored: Mapping[str, Any], key: str, path: Path) -> list[str]:

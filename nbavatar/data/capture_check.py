@@ -1,6 +1,7 @@
 """Everything that can be wrong with a capture, found in one go and said in one line each."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -8,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from nbavatar.camera.pinhole import Camera
+from nbavatar.config.cameras import read_rig
 from nbavatar.data.capture import (
     Capture,
-    parse_camera,
+    camera_of,
     read_coverage,
     read_mask,
     read_mesh,
@@ -20,7 +22,6 @@ from nbavatar.data.capture import (
 )
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
-from nbavatar.io.records import read_json
 from nbavatar.mesh.topology import mesh_defects
 from nbavatar.mesh.zbuffer import rasterize_mesh
 
@@ -99,6 +100,7 @@ def check_capture(
         report.capture = Capture(root, cameras)
     if splits is not None:
         report.frames = splits.frames
+        _note_on_order(root, splits.frames, report)
     meshes = _check_meshes(root, report, found) if report.topology and report.frames else {}
     for camera in cameras.values():
         _check_camera(Capture(root, cameras), camera, report, meshes, found, progress)
@@ -111,14 +113,11 @@ def check_capture(
 
 def _cameras(root: Path, found: _Collector) -> dict[str, Camera]:
     path = root / "cameras.json"
-    stored = read_json(path)
-    if not isinstance(stored, Mapping) or not stored:
-        raise DataError.of(path, expected="a mapping from camera name to its calibration", found=type(stored).__name__)
     cameras = {}
-    for name, entry in stored.items():
-        camera = found.attempt(f"camera {name}", lambda: parse_camera(str(name), entry, path))  # noqa: B023
+    for name, entry in read_rig(path).items():
+        camera = found.attempt(f"camera {name}", lambda: camera_of(name, entry, path))  # noqa: B023
         if camera is not None:
-            cameras[str(name)] = camera
+            cameras[name] = camera
     return cameras
 
 
@@ -248,6 +247,22 @@ def _overlap(
             continue
         covered |= rasterize_mesh(mesh[part], faces, K, width, height, cam_from_world=camera.cam_from_world)[0] >= 0
     return float((covered & small).sum() / max((covered | small).sum(), 1))
+
+
+def _note_on_order(root: Path, frames: list[str], report: CaptureReport) -> None:
+    """Frames are a film in the order of splits.json; another order than that of their names is seldom meant."""
+
+    def natural(frame: str) -> list[tuple[int, str]]:
+        return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"(\d+)", frame)]
+
+    for before, after in zip(frames, frames[1:]):
+        if natural(before) > natural(after):
+            path = root / "splits.json"
+            report.notes.append(
+                f"{path}: frames: {before} comes before {after}; is that the order in time? (a sorting as text puts 10 "
+                "before 9)"
+            )
+            return
 
 
 def _notes_on_topology(root: Path, report: CaptureReport) -> None:

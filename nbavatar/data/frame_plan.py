@@ -7,7 +7,7 @@ from typing import Any
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.capture import Capture, read_splits
 from nbavatar.data.decaf import DecafSubject, check_counts, frame_counts, read_cuts
-from nbavatar.data.splits import choose_frames, held_out_blocks, runs_from_cuts, segments_of, split_digest
+from nbavatar.data.splits import choose_frames, held_out_blocks, runs_from_cuts, split_digest
 from nbavatar.errors import DataError
 
 __all__ = ["FramePlan", "manifest_of", "plan_capture", "plan_decaf"]
@@ -67,8 +67,7 @@ def plan_capture(
     """
     path = capture.root / "splits.json"
     splits = read_splits(capture.root)
-    runs = segments_of(splits.frames, splits.cuts, str(path))
-    numbers, segments = choose_frames(runs, start=start, every=every, max_frames=max_frames)
+    numbers, segments = choose_frames(splits.segments, start=start, every=every, max_frames=max_frames)
     if not numbers:
         raise DataError.of(path, "frames", expected=f"more than start = {start}", found=len(splits.frames))
     frames = [splits.frames[number] for number in numbers]

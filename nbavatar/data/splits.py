@@ -62,13 +62,9 @@ def choose_frames(
 
 
 def segments_of(frames: Sequence[str], cuts: Sequence[Sequence[str]], where: str) -> list[tuple[int, int]]:
-    """Uncut runs, as positions, of frames named by ids, cut at pairs (last id before, first id after).
-
-    Pairs whose frames are not in the list cut nothing.
-    """
+    """Uncut runs, as positions, of frames named by ids, cut at pairs (last id before, first id after) of them."""
     position = {frame: i for i, frame in enumerate(frames)}
-    known = [(position[str(a)], position[str(b)]) for a, b in cuts if str(a) in position and str(b) in position]
-    return runs_from_cuts(sorted(known), len(frames), where)
+    return runs_from_cuts(sorted((position[a], position[b]) for a, b in cuts), len(frames), where)
 
 
 def held_out_blocks(segments: Sequence[tuple[int, int]], *, fraction: float, blocks: int = 1) -> list[str]:

@@ -24,13 +24,13 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """Reads JSON.
+    """Reads JSON; a byte-order mark is skipped.
 
     Raises:
         DataError: the file is missing or is not JSON.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise DataError.of(path, expected="a JSON file", found="no such file") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -51,7 +51,8 @@ def _capture(folder, angles):
     cameras = {}
     for name, angle in angles.items():
         c, s = math.cos(angle), math.sin(angle)
-        cameras[name] = {"R": [[c, 0, -s], [0, 1, 0], [s, 0, c]], "t": [0, 0, 1], "width": 1, "height": 1, "K": []}
+        K = [[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]]
+        cameras[name] = {"R": [[c, 0, -s], [0, 1, 0], [s, 0, c]], "t": [0, 0, 1], "width": 1, "height": 1, "K": K}
     (folder / "cameras.json").write_text(json.dumps(cameras))
 
 
@@ -71,3 +72,28 @@ def test_folder_of_captures_gives_one_subject_each(tmp_path):
     assert list(capture_subjects(str(tmp_path), "")) == ["one", "two"]
     with pytest.raises(ConfigError, match="data_root"):
         capture_subjects(str(tmp_path / "nothing"), "")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "meant"), [("084", "084"), (84, "084"), (110, "110"), (8, "010"), (10, "010"), ("left", "left")]
+)
+def test_numbers_of_the_command_line_are_ids_of_cameras(tmp_path, wanted, meant):
+    _capture(tmp_path / "demo", {"084": -0.6, "110": 0.12, "010": 0.5, "left": 0.0})
+    assert capture_subjects(str(tmp_path / "demo"), wanted)["demo"].test_camera == meant
+
+
+@pytest.mark.parametrize(("wanted", "found"), [(8, "'008' and '010'"), (9, "none; known: 008, 010")])
+def test_a_number_that_means_no_camera_or_two_is_refused(tmp_path, wanted, found):
+    _capture(tmp_path / "demo", {"008": -0.6, "010": 0.5})
+    with pytest.raises(ConfigError, match=f"one camera that {wanted} can mean, found {found}.*in quotes"):
+        capture_subjects(str(tmp_path / "demo"), wanted)
+
+
+def test_sheets_and_cameras_may_begin_with_a_byte_order_mark(tmp_path):
+    path = tmp_path / "s.tsv"
+    path.write_bytes(b"\xef\xbb\xbf" + (HEADER + "S1\t1,2\t3\n").encode())
+    assert read_subjects(path, "root")["S1"].test_camera == "3"
+    _capture(tmp_path / "demo", {"a": -0.6, "b": 0.12})
+    path = tmp_path / "demo/cameras.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert capture_subjects(str(tmp_path / "demo"), "a")["demo"].train_cameras == ("b",)

@@ -65,6 +65,14 @@ def test_a_split_of_the_user_s_wins_and_else_the_last_fraction_is_held_out(captu
     assert plan.split == {"t0": "train", "t1": "test", "t2": "train", "t3": "train"}
 
 
+def test_cuts_divide_all_frames_whether_they_are_used_or_not(capture):
+    edit(capture / "splits.json", lambda s: s.update(cuts=[["t1", "t2"]], train=["t0", "t1", "t3"], test=["t4"]))
+    splits = read_splits(capture)
+    assert splits.frames == ["t0", "t1", "t3", "t4"] and splits.segments == [(0, 1), (2, 3)]
+    edit(capture / "splits.json", lambda s: s.update(train=["t0", "t1"], test=[]))
+    assert read_splits(capture).segments == [(0, 1)]
+
+
 def test_cuts_divide_runs(capture):
     edit(capture / "splits.json", lambda s: s.update(cuts=[["t1", "t2"]]))
     plan = plan_capture(open_capture(capture), **{**CHOICE, "test_fraction": 0.4})
@@ -81,6 +89,9 @@ def test_cuts_divide_runs(capture):
         (lambda s: s.update(frames=["t1", "t1"]), "each frame once"),
         (lambda s: s.update(frames=["../t1"]), "file names without their type"),
         (lambda s: s.update(cuts=["t1"]), "pairs of frame ids"),
+        (lambda s: s.update(cuts=[["1", "2"]]), "cuts: expected pairs of ids that are in frames, found '1'"),
+        (lambda s: s.update(cuts=[["t2", "t1"]]), "cut 0: expected .* found .2, 1."),
+        (lambda s: s.update(cut=[["t1", "t2"]]), "unknown key 'cut'; did you mean 'cuts'"),
     ],
 )
 def test_splits_that_cannot_be(capture, change, line):
