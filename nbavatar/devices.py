@@ -1,29 +1,38 @@
 """Which device a command computes on, and an exclusive lease of one GPU for each process.
 
 Workflow engines count GPUs but do not hand out their numbers: four jobs on a machine with four GPUs all start
-on the first. Here a process takes a lock file per GPU and makes only that GPU visible to itself. The
-kernel drops the lock when the process ends, however it ends. Standard library only, and to be called before
-torch is imported.
+on the first. Here a process takes a lease of one GPU and makes only that GPU visible to itself. A lease is a
+name of the kernel (a socket in Linux's abstract name space, called after the GPU's own identifier), not a file: it
+holds between users, there is no folder that somebody else could have prepared, and the kernel frees it when the
+process ends, however it ends. It does not hold between containers with networks of their own. Standard library only,
+and to be called before torch is imported.
 """
 
 import contextlib
-import fcntl
+import errno
 import os
 import random
+import socket
+import struct
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from nbavatar.errors import DeviceError
+from nbavatar.gpus import list_gpus
 
 __all__ = ["device_name", "lease_device", "peak_memory_mb"]
+
+_SILENCE_S = 5.0  # a wait longer than this says what it waits for
 
 
 @contextlib.contextmanager
 def lease_device(wanted: str = "auto", *, patience_s: float = 24 * 3600.0) -> Iterator[str]:
     """Yields `cpu` or `cuda`, with `CUDA_VISIBLE_DEVICES` set to one GPU of this process's own.
+
+    One GPU that `CUDA_VISIBLE_DEVICES` names already is taken as it is, the batch system or the user has chosen it;
+    among several that it names one is leased, as among all where it is not set.
 
     Args:
         wanted: `cpu`, `cuda`, or `auto` (a GPU where there is one).
@@ -36,21 +45,25 @@ def lease_device(wanted: str = "auto", *, patience_s: float = 24 * 3600.0) -> It
     if wanted not in ("auto", "cpu", "cuda"):
         raise DeviceError.of("device", expected="auto, cpu or cuda", found=repr(wanted))
     assigned = os.environ.get("CUDA_VISIBLE_DEVICES")
-    count = _gpu_count()
-    if wanted == "cpu" or (wanted == "auto" and (count == 0 or assigned == "")):
+    gpus = [] if wanted == "cpu" or assigned == "" else list_gpus()
+    if not gpus:
+        if wanted == "cuda":
+            fix = "use --device cpu or device: cpu"
+            raise DeviceError.of("device", expected="a CUDA device", found="none", fix=fix)
         yield "cpu"
         return
-    if count == 0 or assigned == "":
-        raise DeviceError.of("device", expected="a CUDA device", found="none", fix="use --device cpu or device: cpu")
-    if assigned is not None:  # the batch system or the user has chosen
+    if assigned is not None and len(gpus) == 1:
         yield "cuda"
         return
-    with _locked(count, patience_s) as index:
-        os.environ["CUDA_VISIBLE_DEVICES"] = str(index)
+    with _leased(gpus, patience_s) as gpu:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu
         try:
             yield "cuda"
         finally:
-            os.environ.pop("CUDA_VISIBLE_DEVICES", None)
+            if assigned is None:
+                os.environ.pop("CUDA_VISIBLE_DEVICES", None)
+            else:
+                os.environ["CUDA_VISIBLE_DEVICES"] = assigned
 
 
 def device_name(device: str) -> str:
@@ -80,26 +93,45 @@ def peak_memory_mb(device: str) -> float:
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
-def _gpu_count() -> int:
-    return sum(1 for path in Path("/dev").glob("nvidia[0-9]*") if path.name[6:].isdigit())
-
-
 @contextlib.contextmanager
-def _locked(count: int, patience_s: float) -> Iterator[int]:
-    folder = Path(tempfile.gettempdir()) / f"nbavatar-gpus-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    deadline = time.monotonic() + patience_s
+def _leased(gpus: list[str], patience_s: float) -> Iterator[str]:
+    """Holds one of some GPUs, the first that is free."""
+    began, told = time.monotonic(), False
     while True:
-        for index in range(count):
-            stream = open(folder / f"gpu{index}.lock", "w")
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                stream.close()
-                continue
-            with stream:
-                yield index
-            return
-        if time.monotonic() > deadline:
-            raise DeviceError(f"none of the {count} GPUs came free within {patience_s:.0f} s")
+        for gpu in gpus:
+            with socket.socket(socket.AF_UNIX) as lease:
+                try:
+                    lease.bind(_lease_name(gpu))
+                except OSError as error:
+                    if error.errno == errno.EADDRINUSE:
+                        continue
+                    fix = "name one in CUDA_VISIBLE_DEVICES"
+                    found = f"an error of the system ({error.strerror})"
+                    raise DeviceError.of("device", expected="a lease of a GPU", found=found, fix=fix) from error
+                lease.listen(64)  # whoever waits can ask who holds it
+                yield gpu
+                return
+        waited = time.monotonic() - began
+        if waited > patience_s:
+            raise DeviceError(f"none of the {len(gpus)} GPUs came free within {patience_s:.0f} s; {_holders(gpus)}")
+        if waited > min(_SILENCE_S, patience_s) and not told:
+            print(f"nbavatar: waiting for a GPU: {_holders(gpus)}", file=sys.stderr)  # noqa: T201
+            told = True
         time.sleep(random.uniform(0.2, 1.0))
+
+
+def _lease_name(gpu: str) -> str:
+    return f"\0nbavatar-{gpu}"
+
+
+def _holders(gpus: list[str]) -> str:
+    """Which processes hold which GPUs, for people."""
+    known = []
+    for gpu in gpus:
+        with socket.socket(socket.AF_UNIX) as asking, contextlib.suppress(OSError):
+            asking.setblocking(False)
+            asking.connect(_lease_name(gpu))
+            record = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+            process, user, _ = struct.unpack("3i", record)
+            known.append(f"{gpu} is held by process {process} of user {user}")
+    return ", ".join(known) or "their holders are not known"

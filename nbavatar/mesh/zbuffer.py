@@ -11,13 +11,14 @@ each other in floating point, so closed surfaces have no cracks.
 import os
 from concurrent.futures import ThreadPoolExecutor
 
-import numba
 import numpy as np
+
+from nbavatar.kernels import stored_njit
 
 __all__ = ["project_bounds", "rasterize_mesh"]
 
 
-@numba.njit(cache=True, nogil=True)
+@stored_njit(nogil=True)
 def project_bounds(
     verts: np.ndarray, face: np.ndarray, k: np.ndarray, near: float
 ) -> tuple[float, float, float, float]:
@@ -47,7 +48,7 @@ def project_bounds(
     return x_min, x_max, y_min, y_max
 
 
-@numba.njit(cache=True, nogil=True)
+@stored_njit(nogil=True)
 def _cover(verts, faces, bounds, k, near, row0, row1, cull, face_id, bary, depth):
     """Draw all faces into the rows ``row0 <= y < row1`` of the three images, in place."""
     width = face_id.shape[1]
@@ -91,7 +92,7 @@ def _cover(verts, faces, bounds, k, near, row0, row1, cull, face_id, bary, depth
                 bary[y, x, 2] = e2 / total
 
 
-@numba.njit(cache=True, nogil=True)
+@stored_njit(nogil=True)
 def _all_bounds(verts, faces, k, near):
     bounds = np.zeros((len(faces), 4))
     for f in range(len(faces)):

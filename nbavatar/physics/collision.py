@@ -3,9 +3,9 @@
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from nbavatar.kernels import stored_njit
 from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.mesh.tree import in_box
 
@@ -144,7 +144,7 @@ def _depths(mesh: DeformingMesh, points: np.ndarray, radius: float) -> tuple[np.
     return np.where(inside, distance, 0.0), distance
 
 
-@numba.njit(cache=True)
+@stored_njit()
 def _longest(points, edges):
     """Length of the longest edge."""
     square = 0.0
@@ -155,7 +155,7 @@ def _longest(points, edges):
     return np.sqrt(square)
 
 
-@numba.njit(cache=True)
+@stored_njit()
 def _groups(member, edges):
     """A label for each vertex: equal for members joined by edges between members (union-find)."""
     parent = np.arange(len(member))
@@ -292,7 +292,7 @@ def _way_out(found: _Meeting, hand: DeformingMesh) -> _Meeting:
     return found if keep.all() else _Meeting(*(column[keep] for column in found))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _surface_points(values, ids, weights):
     """Weighted sums (P, 3) of rows of `values` (V, 3): ids (P, 3), weights (P, 3)."""
     result = np.zeros((len(ids), 3))
@@ -304,7 +304,7 @@ def _surface_points(values, ids, weights):
     return result
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _normals(points, nearest, depth, away, skin):
     """Unit normals from head to hand (P, 3), and which were turned; `away` (P, 3) is out of the head, any length."""
     normals, turned = np.zeros((len(points), 3)), np.zeros(len(points), np.bool_)

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import scipy.sparse
 
+from nbavatar.kernels import stored_njit
 from nbavatar.mesh.drawing import vertex_normals
 from nbavatar.physics.tissue import SoftSurface
 
@@ -69,7 +69,7 @@ def _symmetric(values: np.ndarray, a: np.ndarray, b: np.ndarray, count: int) -> 
     return (matrix + matrix.T).tocsr()
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _spread(distance, touched, start, near, length, limit):
     """Shortest ways from the touched vertices, by a ring of vertices whose neighbours are to be looked at again."""
     count = len(distance)
@@ -96,7 +96,7 @@ def _spread(distance, touched, start, near, length, limit):
                     size += 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _around(moving, head, edges, faces):
     """Edges with an end that moves, their lengths, and faces all of whose corners move."""
     pairs, lengths = np.zeros((len(edges), 2), np.int64), np.zeros(len(edges))

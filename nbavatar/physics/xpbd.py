@@ -8,13 +8,14 @@ order: deterministic. There is no velocity: skin is overdamped, and a step start
 
 import math
 
-import numba
 import numpy as np
+
+from nbavatar.kernels import stored_njit
 
 __all__ = ["relax"]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def relax(
     x, rest, inverse_mass, active, support, edges, lengths, stretch, shear, ring, ring_ids, ring_weights, bend,
     faces, bulge, volume_stiffness, contacts, ids, weights, hand, pose, pose_inverse_mass, pose_stiffness, pose_bound,
@@ -84,7 +85,7 @@ def relax(
     return pressed
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _support(x, rest, inverse_mass, active, support, h2, impulse):
     """Bed: every vertex to its rest place."""
     for s in range(len(active)):
@@ -98,7 +99,7 @@ def _support(x, rest, inverse_mass, active, support, h2, impulse):
                 x[i, c] += w * step
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _stretch(x, inverse_mass, edges, lengths, compliance, impulse):
     """Membrane: every edge to its rest length."""
     for e in range(len(edges)):
@@ -119,7 +120,7 @@ def _stretch(x, inverse_mass, edges, lengths, compliance, impulse):
             x[j, 2] -= wj * d2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _shear(x, rest, inverse_mass, edges, compliance, impulse):
     """Shear layer: neighbours are displaced alike."""
     for e in range(len(edges)):
@@ -134,7 +135,7 @@ def _shear(x, rest, inverse_mass, edges, compliance, impulse):
                 x[j, c] -= wj * step
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _bend(x, rest, inverse_mass, active, ring, ring_ids, ring_weights, bend, h2, impulse):
     """Plate: the displacement's Laplacian to zero."""
     for s in range(len(active)):
@@ -173,7 +174,7 @@ def _bend(x, rest, inverse_mass, active, ring, ring_ids, ring_weights, bend, h2,
         x[i, 2] -= f * s2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _hold_hands(pose, pose_inverse_mass, pose_stiffness, h2, impulse):
     """Hands: towards their tracked pose."""
     for k in range(len(pose)):
@@ -187,7 +188,7 @@ def _hold_hands(pose, pose_inverse_mass, pose_stiffness, h2, impulse):
                     pose[k, c] += w * step
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _limit(x, rest, inverse_mass, active, max_dent):
     """No point goes farther than `max_dent` from its rest place."""
     for s in range(len(active)):
@@ -201,7 +202,7 @@ def _limit(x, rest, inverse_mass, active, max_dent):
             x[i, 2] = rest[i, 2] + shrink * u2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _bound(pose, bound):
     for k in range(len(pose)):
         for part in range(2):
@@ -214,7 +215,7 @@ def _bound(pose, bound):
                 pose[k, c + 2] *= shrink
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _volume(x, origin, faces, gradient):
     """Volume between faces and a point [m^3]; adds its derivative by each corner to `gradient`, of the closed region.
 
@@ -237,7 +238,7 @@ def _volume(x, origin, faces, gradient):
     return total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _hold_volume(x, inverse_mass, active, faces, bulge, gradient, origin, volume, impulse, stiffness):
     """One projection of the volume constraint; returns the change of its impulse."""
     for s in range(len(active)):
@@ -260,7 +261,7 @@ def _hold_volume(x, inverse_mass, active, faces, bulge, gradient, origin, volume
     return step
 
 
-@numba.njit(cache=True, error_model="numpy")
+@stored_njit(error_model="numpy")
 def _touch(
     x, start, inverse_mass, contacts, ids, weights, hand, pose, entry, pose_inverse_mass, centre, friction, pressed,
     sheared,

@@ -3,11 +3,13 @@
 from functools import partial
 from pathlib import Path
 
-from nbavatar.raster.compile import inlined, keep_kernels, kernel
+from nbavatar.kernels import keep_kernels
+from nbavatar.raster.compile import SOURCES, inlined, kernel
 from nbavatar.raster.compile import prepare as _prepare
 
 __all__ = ["inlined", "kernel", "prepare"]
 
 _HERE = Path(__file__).parent
-keep_kernels(_HERE, ("cpu_kernels.py", "geometry_kernels.py", "lanes.py", "projection.py", "spherical_harmonics.py"))
+_OWN = ("cpu_kernels.py", "geometry_kernels.py", "lanes.py", "projection.py", "spherical_harmonics.py")
+keep_kernels(_HERE, (*SOURCES, *(_HERE / name for name in _OWN)))
 prepare = partial(_prepare, package=_HERE)
