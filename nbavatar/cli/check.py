@@ -55,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
             return 2
         return _check_decaf(root, wanted, Path(args.out) if args.out else None)
     report = check_capture(root, progress)
-    if args.out and report.capture is not None:
+    if args.out and report.capture is not None and report.frames:
         _write_overlays(report, Path(args.out))
     for line in report.notes:
         print(f"note: {line}")

@@ -26,7 +26,9 @@ from nbavatar.data.capture import open_capture
 from nbavatar.data.decaf import find_subject, read_camera
 from nbavatar.data.frame_plan import manifest_of, plan_capture, plan_decaf
 from nbavatar.data.sources import LAYERS, capture_images, capture_layers, decaf_images
+from nbavatar.errors import ConfigError
 from nbavatar.io.framepack import FramePackWriter
+from nbavatar.names import check_name
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
@@ -49,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> None:
     """Writes the pack."""
     cfg = stage_config(args, IngestConfig)
+    check_name(args.subject, "--subject", error=ConfigError)
     choice = {key: getattr(cfg, key) for key in ("start", "every", "max_frames", "test_fraction", "test_blocks")}
     if args.layout == "decaf":
         subject = find_subject(args.root, args.subject)

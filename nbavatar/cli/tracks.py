@@ -32,6 +32,8 @@ from nbavatar.data.decaf_tracks import build_tracks
 from nbavatar.data.frame_plan import plan_capture, plan_decaf
 from nbavatar.data.sequences import write_sequence
 from nbavatar.data.splits import split_digest
+from nbavatar.errors import ConfigError
+from nbavatar.names import check_name
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
@@ -56,6 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> None:
     """Writes the sequence."""
     cfg = stage_config(args, TracksConfig)
+    check_name(args.subject, "--subject", error=ConfigError)
     choice = {key: getattr(cfg, key) for key in ("start", "every", "max_frames", "test_fraction", "test_blocks")}
     if args.layout == "decaf":
         subject = find_subject(args.root, args.subject)

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nbavatar.errors import ConfigError, DataError, describe, did_you_mean
+from nbavatar.names import check_name
 
 __all__ = ["StoredCamera", "choose_camera", "parse_camera", "read_rig"]
 
@@ -106,9 +107,9 @@ def parse_camera(name: str, entry: Any, path: str | os.PathLike[str]) -> StoredC
         path: the file, for error lines.
 
     Raises:
-        DataError: a key that is missing or unknown, or a value that describes no pinhole camera.
+        DataError: a name that is none, a key that is missing or unknown, or a value that describes no pinhole camera.
     """
-    where = f"{path}: camera {name}"
+    where = f"{path}: camera {check_name(name, path, 'camera', error=DataError)}"
     if not isinstance(entry, Mapping):
         raise DataError.of(where, expected=", ".join(_NEEDED), found=type(entry).__name__)
     _check_keys(entry, where)

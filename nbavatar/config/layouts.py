@@ -7,6 +7,7 @@ from typing import TypeVar
 
 from nbavatar.config.core import from_mapping
 from nbavatar.errors import ConfigError, did_you_mean
+from nbavatar.names import check_name
 
 __all__ = ["choose_layout", "read_layouts"]
 
@@ -34,7 +35,8 @@ def read_layouts(path: str | os.PathLike[str], cls: type[T], kind: str) -> dict[
         raise ConfigError.of(path, expected="YAML", found=f"text that does not parse ({error})") from error
     if not isinstance(content, dict):
         raise ConfigError.of(path, expected=f"{kind} name -> layout", found=type(content).__name__)
-    return {str(name): from_mapping(cls, value, f"{path}: {name}") for name, value in content.items()}
+    named = {check_name(str(name), path, kind, error=ConfigError): value for name, value in content.items()}
+    return {name: from_mapping(cls, value, f"{path}: {name}") for name, value in named.items()}
 
 
 def choose_layout(layouts: Mapping[str, T], name: str, where: str, kind: str) -> T:

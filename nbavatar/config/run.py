@@ -4,7 +4,6 @@ Every value has the paper's setting as its default, so a configuration file list
 """
 
 import dataclasses
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +14,7 @@ from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, Spect
 from nbavatar.config.preprocess import CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
 from nbavatar.errors import ConfigError, did_you_mean
+from nbavatar.names import check_name, check_place
 
 __all__ = ["RunConfig", "Stages", "TradeoffRun", "Variant", "load_run", "stage_options"]
 
@@ -117,8 +117,13 @@ def load_run(mapping: Mapping[str, Any], where: str = "config") -> RunConfig:
         ConfigError: an unknown key, a wrong type, a value out of range, a crop or stage that does not exist.
     """
     run = from_mapping(RunConfig, mapping, where)
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", run.run):
-        raise ConfigError.of(f"{where}.run", expected="letters, digits, '_' and '-'", found=repr(run.run))
+    check_name(run.run, f"{where}.run", error=ConfigError)
+    for key in ("data_root", "tables", "reported", "figures"):
+        check_place(getattr(run, key), f"{where}.{key}", error=ConfigError)
+    check_place(run.tradeoff.sheet, f"{where}.tradeoff.sheet", error=ConfigError)
+    for key in ("crops", "protocols", "variants"):
+        for name in getattr(run, key):
+            check_name(name, f"{where}.{key}", error=ConfigError)
     for name, crop in [(f"variants.{n}", v.crop) for n, v in run.variants.items()] + [
         (f"protocols.{n}", p.crop) for n, p in run.protocols.items()
     ]:

@@ -7,16 +7,14 @@ import csv
 import dataclasses
 import math
 import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from nbavatar.config.cameras import choose_camera, parse_camera, read_rig
 from nbavatar.errors import ConfigError, DataError, did_you_mean
+from nbavatar.names import check_name, check_place, name_like
 
 __all__ = ["Row", "Subject", "capture_subjects", "read_rows", "read_subjects"]
-
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +52,9 @@ def read_subjects(path: str | os.PathLike[str], root: str) -> dict[str, Subject]
         where = f"{path}, line {line}"
         train = tuple(part.strip() for part in row["train_cameras"].split(",") if part.strip())
         subject = Subject(row["subject"], train, row["test_camera"], root)
-        for name in (subject.name, *subject.cameras):
-            if not _NAME.fullmatch(name):
-                raise ConfigError.of(where, expected="ids of letters, digits, '_', '-' and '.'", found=repr(name))
+        check_name(subject.name, where, "subject", error=ConfigError)
+        for camera in subject.cameras:
+            check_name(camera, where, "camera", error=ConfigError)
         if subject.name in subjects:
             raise ConfigError.of(where, "subject", expected="each subject once", found=f"{subject.name} again")
         if not train or len(set(subject.cameras)) != len(subject.cameras):
@@ -88,6 +86,7 @@ def capture_subjects(root: str, test_camera: str | int) -> dict[str, Subject]:
     subjects = {}
     for folder in folders:
         path = folder / "cameras.json"
+        check_place(str(folder), folder, "name of the folder", error=ConfigError)
         try:
             rig = {name: parse_camera(name, entry, path) for name, entry in read_rig(path).items()}
         except DataError as error:
@@ -97,7 +96,12 @@ def capture_subjects(root: str, test_camera: str | int) -> dict[str, Subject]:
             raise ConfigError.of(path, expected="two cameras or more", found=len(centres))
         held_out = _best_surrounded(centres) if test_camera == "" else choose_camera(test_camera, rig, "test_camera")
         train = tuple(sorted(set(centres) - {held_out}))
-        name = re.sub(r"[^A-Za-z0-9_.-]", "_", folder.resolve().name)
+        name = check_name(name_like(folder.resolve().name), folder, "name of the folder", error=ConfigError)
+        if name in subjects:
+            raise ConfigError.of(
+                folder, expected="a subject of its own",
+                found=f"'{name}', which {subjects[name].root} is called already", fix="rename one of the folders",
+            )  # fmt: skip
         subjects[name] = Subject(name, train, held_out, str(folder))
     return subjects
 

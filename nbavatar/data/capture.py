@@ -27,6 +27,7 @@ from nbavatar.errors import DataError, describe, did_you_mean
 from nbavatar.io.arrays import read_arrays
 from nbavatar.io.images import decode_image
 from nbavatar.io.records import read_json
+from nbavatar.names import check_name
 
 __all__ = [
     "Capture",
@@ -251,10 +252,7 @@ def _ids(stored: Mapping[str, Any], key: str, path: Path) -> list[str]:
     twice = [v for i, v in enumerate(ids) if v in ids[:i]] if len(set(ids)) != len(ids) else []
     if twice:
         raise DataError.of(path, key, expected="each frame once", found=f"'{twice[0]}' twice")
-    odd = [v for v in ids if not v or "/" in v or v.startswith(".")]
-    if odd:
-        raise DataError.of(path, key, expected="ids that are file names without their type", found=repr(odd[0]))
-    return ids
+    return [check_name(frame, path, key, error=DataError) for frame in ids]
 
 
 def _sized(image: np.ndarray, path: Path, camera: Camera) -> np.ndarray:

@@ -24,6 +24,7 @@ from nbavatar.camera.pinhole import Camera
 from nbavatar.errors import DataError, did_you_mean
 from nbavatar.io.pickles import read_array, read_pickle
 from nbavatar.io.video import probe_video
+from nbavatar.names import check_name
 
 __all__ = [
     "CAMERAS",
@@ -124,6 +125,7 @@ def find_subject(root: str | Path, name: str) -> DecafSubject:
     root = Path(root)
     if not root.is_dir():
         raise DataError.of(root, expected="the folder of the Decaf dataset", found="no such folder")
+    check_name(name, root, "subject", error=DataError)
     subjects = list_subjects(root)
     if not subjects:
         raise DataError.of(root, expected="train/videos/<subject> and test/videos/<subject>", found="neither")
@@ -149,6 +151,7 @@ def read_camera(subject: DecafSubject, camera: str, *, pixel_center: float = 0.5
         DataError: no such camera or video, or a calibration that is no pinhole camera.
     """
     path = subject.file("cameras", "cameras.pkl")
+    check_name(camera, path, "camera", error=DataError)
     stored = read_pickle(path)
     if not isinstance(stored, Mapping):
         raise DataError.of(path, expected="a mapping of cameras", found=type(stored).__name__)

@@ -20,6 +20,7 @@ import numpy as np
 
 from nbavatar.errors import DataError
 from nbavatar.io.arrays import read_arrays, write_arrays
+from nbavatar.names import check_name
 
 __all__ = ["PARTS", "MeshSequence", "Part", "read_sequence", "write_sequence"]
 
@@ -102,7 +103,8 @@ def read_sequence(path: str | os.PathLike[str]) -> tuple[MeshSequence, dict[str,
     }
     core = {"frames"} | {f"{name}.{key}" for name in PARTS for key in ("faces", "rest", "verts")}
     extras = {name: value for name, value in arrays.items() if name not in core}
-    return MeshSequence([str(f) for f in arrays["frames"]], parts, extras), record
+    frames = [check_name(str(frame), path, "frames", error=DataError) for frame in arrays["frames"]]
+    return MeshSequence(frames, parts, extras), record
 
 
 def _check(path: str, arrays: Mapping[str, np.ndarray]) -> None:

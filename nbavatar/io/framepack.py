@@ -28,6 +28,7 @@ from nbavatar.errors import DataError
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.images import decode_image, encode_png
 from nbavatar.io.records import canonical_json
+from nbavatar.names import check_name
 
 __all__ = ["FORMAT", "UNSEEN", "FramePack", "FramePackWriter"]
 
@@ -114,6 +115,12 @@ class FramePack:
                 raise DataError.of(path, key, expected="this key in manifest.json", found="none")
         self.frames: list[str] = list(self.manifest["frames"])
         self.layers: list[str] = list(self.manifest["layers"])
+        check_name(str(self.manifest["subject"]), path, "subject", error=DataError)
+        # Renders are of several cameras, and their frames are <camera>/<frame>.
+        for camera in str(self.manifest["camera"]).split(","):
+            check_name(camera, path, "camera", error=DataError)
+        for piece in {piece for frame in self.frames for piece in str(frame).split("/")}:
+            check_name(piece, path, "frames", error=DataError)
 
     def __enter__(self) -> Self:
         return self

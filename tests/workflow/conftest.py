@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-# Creates whatever a rule's command is asked to write, and does nothing else.
-STUB = """#!/bin/sh
+# Creates whatever a rule's command is asked to write, notes its words in `calls`, and does nothing else.
+STUB = """#!/bin/bash
 verb=$1
+printf '%q ' "$@" | tr '\\n' ' ' >> calls; echo >> calls
 make() { mkdir -p "$(dirname "$1")"; echo made > "$1"; }
 while [ $# -gt 0 ]; do
   case "$verb $1" in

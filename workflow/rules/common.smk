@@ -1,6 +1,8 @@
 """Sheets, checks, and the functions that rules share. Nothing here computes, and nothing imports torch."""
 
 import json
+import re
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -47,24 +49,30 @@ R = f"results/{RUN.run}"
 # A capture brings meshes: nothing is refitted, but they may be aligned to its pictures.
 ALIGNED = RUN.layout == "capture" and RUN.stages.align.iterations > 0
 
+
+def one_of(names):
+    """Regular expression that matches exactly these names."""
+    return "|".join(map(re.escape, sorted(names)))
+
+
 # `.venv/bin/snakemake` works without activating its environment, also where another one is active: its commands are
 # then found beside it.
 BESIDE = Path(sys.executable).parent
 if shutil.which("snakemake") != str(BESIDE / "snakemake"):
-    shell.prefix(f'export PATH="{BESIDE}:$PATH"; ')
+    shell.prefix(f'export PATH={shlex.quote(str(BESIDE))}:"$PATH"; ')
 
 
 wildcard_constraints:
-    run=RUN.run,
-    subject="|".join(SUBJECTS),
-    camera="|".join(sorted({c for s in SUBJECTS.values() for c in s.cameras})),
-    crop="|".join(RUN.crops),
-    variant="|".join(RUN.variants),
-    protocol="|".join(RUN.protocols),
-    table="|".join(TABLES),
-    figure="|".join(FIGURES),
-    source="|".join(SUBJECTS),
-    target="|".join(SUBJECTS),
+    run=one_of([RUN.run]),
+    subject=one_of(SUBJECTS),
+    camera=one_of({c for s in SUBJECTS.values() for c in s.cameras}),
+    crop=one_of(RUN.crops),
+    variant=one_of(RUN.variants),
+    protocol=one_of(RUN.protocols),
+    table=one_of(TABLES),
+    figure=one_of(FIGURES),
+    source=one_of(SUBJECTS),
+    target=one_of(SUBJECTS),
     kind="driven|turntable",
 
 

@@ -27,8 +27,8 @@ rule render:
         protocol=protocol_options,
         code=code_digest("render"),
     shell:
-        "nbavatar render --model {input.model} --meshes {input.meshes} --frames {input.frames}"
-        " --protocol {params.protocol:q} --out {output} --device {params.device} > {log} 2>&1"
+        "nbavatar render --model {input.model:q} --meshes {input.meshes:q} --frames {input.frames:q}"
+        " --protocol {params.protocol:q} --out {output:q} --device {params.device:q} > {log:q} 2>&1"
 
 
 rule evaluate:
@@ -50,9 +50,9 @@ rule evaluate:
         cfg=options("evaluate"),
         code=code_digest("evaluate"),
     shell:
-        "nbavatar evaluate --render {input.render} --frames {input.frames} --train-frames {input.train}"
-        " --protocol {params.protocol:q} --out {output.record} --csv {output.images}"
-        " --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar evaluate --render {input.render:q} --frames {input.frames:q} --train-frames {input.train:q}"
+        " --protocol {params.protocol:q} --out {output.record:q} --csv {output.images:q}"
+        " --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 # Timing wants the machine for itself: it takes every core, so no other job of this workflow runs beside it. (On a cluster,
@@ -76,5 +76,5 @@ rule speed:
         cfg=options("speed"),
         code=code_digest("speed"),
     shell:
-        "nbavatar speed --model {input.model} --meshes {input.meshes} --frames {input.frames[0]}"
-        " --out {output} --device {params.device} --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar speed --model {input.model:q} --meshes {input.meshes:q} --frames {input.frames[0]:q}"
+        " --out {output:q} --device {params.device:q} --cfg {params.cfg:q} > {log:q} 2>&1"

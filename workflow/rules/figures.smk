@@ -20,14 +20,14 @@ rule reenact:
         runtime="1h",
     params:
         assets=lambda w: (
-            f"--assets {Path(RUN.data_root) / 'assets'}"
+            ["--assets", str(Path(RUN.data_root) / "assets")]
             if RUN.layout == "decaf"
-            else ""
+            else []
         ),
         code=code_digest("reenact"),
     shell:
-        "nbavatar reenact --source {input.source} --target {input.target} {params.assets}"
-        " --out {output} > {log} 2>&1"
+        "nbavatar reenact --source {input.source:q} --target {input.target:q} {params.assets:q}"
+        " --out {output:q} > {log:q} 2>&1"
 
 
 rule reenact_contact:
@@ -45,7 +45,7 @@ rule reenact_contact:
         cfg=options("deform"),
         code=code_digest("deform"),
     shell:
-        "nbavatar deform --meshes {input} --out {output} --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar deform --meshes {input:q} --out {output:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 rule video:
@@ -73,8 +73,8 @@ rule video:
         cfg=options("video"),
         code=code_digest("video"),
     shell:
-        "nbavatar video --model {input.model} --meshes {input.meshes} --camera {input.camera} --kind {wildcards.kind}"
-        " --out {output.video} --device {params.device} --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar video --model {input.model:q} --meshes {input.meshes:q} --camera {input.camera:q} --kind {wildcards.kind:q}"
+        " --out {output.video:q} --device {params.device:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 # A figure asks for the results that it shows, and for no others.
@@ -106,6 +106,6 @@ rule figure:
         stem=lambda w, output: output.png[:-4],
         code=code_digest("figure"),
     shell:
-        "nbavatar figure --figure {wildcards.figure} --layout {input.layout} --renders {input.renders}"
-        " --frames {input.frames} --evals {input.evals} --speeds {input.speeds} --histories {input.histories}"
-        " --models {input.models} --sequences {input.sequences} --out-stem {params.stem} > {log} 2>&1"
+        "nbavatar figure --figure {wildcards.figure:q} --layout {input.layout:q} --renders {input.renders:q}"
+        " --frames {input.frames:q} --evals {input.evals:q} --speeds {input.speeds:q} --histories {input.histories:q}"
+        " --models {input.models:q} --sequences {input.sequences:q} --out-stem {params.stem:q} > {log:q} 2>&1"

@@ -39,8 +39,8 @@ if RUN.layout == "decaf":
             cfg=options("fit"),
             code=code_digest("fit"),
         shell:
-            "nbavatar fit --tracks {input.tracks} --assets {params.assets:q} --frames {input.frames}"
-            " --out {output.meshes} --sheet {output.sheet} --cfg {params.cfg:q} > {log} 2>&1"
+            "nbavatar fit --tracks {input.tracks:q} --assets {params.assets:q} --frames {input.frames:q}"
+            " --out {output.meshes:q} --sheet {output.sheet:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 if ALIGNED:
@@ -66,8 +66,8 @@ if ALIGNED:
             cfg=options("align"),
             code=code_digest("align"),
         shell:
-            "nbavatar align --meshes {input.meshes} --frames {input.frames} --out {output}"
-            " --cfg {params.cfg:q} > {log} 2>&1"
+            "nbavatar align --meshes {input.meshes:q} --frames {input.frames:q} --out {output:q}"
+            " --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 rule spectral:
@@ -91,8 +91,8 @@ rule spectral:
         cfg=options("spectral"),
         code=code_digest("spectral"),
     shell:
-        "nbavatar spectral --meshes {input} --out {output.meshes} --picture {output.picture}"
-        " --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar spectral --meshes {input:q} --out {output.meshes:q} --picture {output.picture:q}"
+        " --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 rule deform:
@@ -121,6 +121,6 @@ rule deform:
         cfg=options("deform"),
         code=code_digest("deform"),
     shell:
-        "nbavatar deform --meshes {input} --out {output.meshes} --exr {output.maps} --validate {output.picture}"
-        " --table {output.table}"
-        " --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar deform --meshes {input:q} --out {output.meshes:q} --exr {output.maps:q} --validate {output.picture:q}"
+        " --table {output.table:q}"
+        " --cfg {params.cfg:q} > {log:q} 2>&1"

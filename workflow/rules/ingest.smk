@@ -30,7 +30,7 @@ if RUN.synthetic:
             code=code_digest("synthesize"),
             root=data_root,
         shell:
-            "nbavatar synthesize --out {params.root} --cfg {params.cfg:q} > {log} 2>&1"
+            "nbavatar synthesize --out {params.root:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 rule ingest:
@@ -49,8 +49,8 @@ rule ingest:
         cfg=options("ingest"),
         code=code_digest("ingest"),
     shell:
-        "nbavatar ingest --layout {params.layout} --root {params.root:q} --subject {wildcards.subject}"
-        " --camera {wildcards.camera} --out {output} --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar ingest --layout {params.layout:q} --root {params.root:q} --subject {wildcards.subject:q}"
+        " --camera {wildcards.camera:q} --out {output:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 rule tracks:
@@ -70,5 +70,5 @@ rule tracks:
         cfg=options("tracks"),
         code=code_digest("tracks"),
     shell:
-        "nbavatar tracks --layout {params.layout} --root {params.root:q} --subject {wildcards.subject}"
-        " --cameras {params.cameras} --out {output} --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar tracks --layout {params.layout:q} --root {params.root:q} --subject {wildcards.subject:q}"
+        " --cameras {params.cameras:q} --out {output:q} --cfg {params.cfg:q} > {log:q} 2>&1"

@@ -20,8 +20,8 @@ rule masks:
         cfg=options("masks"),
         code=code_digest("masks"),
     shell:
-        "nbavatar masks --frames {input.frames} --meshes {input.meshes} --out {output}"
-        " --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar masks --frames {input.frames:q} --meshes {input.meshes:q} --out {output:q}"
+        " --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 rule crop:
@@ -40,5 +40,5 @@ rule crop:
         cfg=crop_options,
         code=code_digest("crop"),
     shell:
-        "nbavatar crop --frames {input.frames} --masks {input.masks} --meshes {input.meshes} --out {output}"
-        " --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar crop --frames {input.frames:q} --masks {input.masks:q} --meshes {input.meshes:q} --out {output:q}"
+        " --cfg {params.cfg:q} > {log:q} 2>&1"

@@ -33,9 +33,9 @@ rule table:
         cfg=options("table"),
         code=code_digest("table"),
     shell:
-        "nbavatar table --table {wildcards.table} --layout {input.layout} --reported {input.reported}"
-        " --evals {input.evals} --speeds {input.speeds} --out-stem {params.stem} --size-label={params.label:q}"
-        " --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar table --table {wildcards.table:q} --layout {input.layout:q} --reported {input.reported:q}"
+        " --evals {input.evals:q} --speeds {input.speeds:q} --out-stem {params.stem:q} --size-label={params.label:q}"
+        " --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 rule report:
@@ -72,8 +72,8 @@ rule report:
         cfg=options("report"),
         code=code_digest("report"),
     shell:
-        "nbavatar report --tables {input.tables} {input.contact} --evals {input.evals} --renders {input.renders}"
-        " --speeds {input.speeds} --frames {input.frames} --histories {input.histories}"
-        " --pictures {input.pictures} --videos {input.videos} --tradeoffs {input.tradeoffs}"
-        " --extremes {input.extremes} --size-label={params.label:q}"
-        " --out {output} --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar report --tables {input.tables:q} {input.contact:q} --evals {input.evals:q} --renders {input.renders:q}"
+        " --speeds {input.speeds:q} --frames {input.frames:q} --histories {input.histories:q}"
+        " --pictures {input.pictures:q} --videos {input.videos:q} --tradeoffs {input.tradeoffs:q}"
+        " --extremes {input.extremes:q} --size-label={params.label:q}"
+        " --out {output:q} --cfg {params.cfg:q} > {log:q} 2>&1"

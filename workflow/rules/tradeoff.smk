@@ -45,9 +45,9 @@ rule tradeoff:
         side=RUN.tradeoff.side,
         code=code_digest("tradeoff"),
     shell:
-        "nbavatar tradeoff {params.what} --model {input.model} --meshes {input.meshes} --frames {input.frames}"
-        " --train-frames {input.train} --protocol {params.protocol:q} --sheet {input.sheet} --side {params.side}"
-        " --out {params.folder} --device {params.device} > {log} 2>&1"
+        "nbavatar tradeoff {params.what:q} --model {input.model:q} --meshes {input.meshes:q} --frames {input.frames:q}"
+        " --train-frames {input.train:q} --protocol {params.protocol:q} --sheet {input.sheet:q} --side {params.side:q}"
+        " --out {params.folder:q} --device {params.device:q} > {log:q} 2>&1"
 
 
 # Every switch of "only what a scene requires", on and off.
@@ -91,8 +91,8 @@ rule offline:
         folder=lambda w, output: Path(output.result).parent,
         code=code_digest("tradeoff"),
     shell:
-        "nbavatar tradeoff --offline --meshes {input.meshes} --sheet {input.sheet} --out {params.folder}"
-        " > {log} 2>&1"
+        "nbavatar tradeoff --offline --meshes {input.meshes:q} --sheet {input.sheet:q} --out {params.folder:q}"
+        " > {log:q} 2>&1"
 
 
 rule extremes:
@@ -122,4 +122,4 @@ rule extremes:
         quick="--quick" if RUN.extremes == "quick" else "",
         code=code_digest("extremes"),
     shell:
-        "nbavatar extremes --out {params.folder} {params.quick} --strict > {log} 2>&1"
+        "nbavatar extremes --out {params.folder:q} {params.quick:q} --strict > {log:q} 2>&1"

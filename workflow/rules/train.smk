@@ -30,5 +30,5 @@ rule train:
         cfg=options("train"),
         code=code_digest("train"),
     shell:
-        "nbavatar train --frames {input.frames} --meshes {input.meshes} --spectral {input.spectral}"
-        " --out {output.model} --history {output.history} --device {params.device} --cfg {params.cfg:q} > {log} 2>&1"
+        "nbavatar train --frames {input.frames:q} --meshes {input.meshes:q} --spectral {input.spectral:q}"
+        " --out {output.model:q} --history {output.history:q} --device {params.device:q} --cfg {params.cfg:q} > {log:q} 2>&1"

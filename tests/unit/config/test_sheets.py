@@ -27,7 +27,7 @@ def test_camera_ids_stay_text(tmp_path):
         (HEADER + "S1\t110,102\t102\n", "without the test camera"),
         (HEADER + "S1\t\t102\n", "found none"),
         (HEADER + "S1\t1\t2\nS1\t1\t2\n", "S1 again"),
-        (HEADER + "S/1\t1\t2\n", "ids of letters"),
+        (HEADER + "S/1\t1\t2\n", "a name of letters"),
         (HEADER + "S1\t1\n", "3 columns"),
         ("subject\ttest_camera\n", "header"),
     ],

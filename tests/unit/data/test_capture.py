@@ -87,7 +87,7 @@ def test_cuts_divide_runs(capture):
         (lambda s: s.update(train=["t1"], test=["t1"]), "'t1', which is in both"),
         (lambda s: s.update(frames=[]), "at least one frame id"),
         (lambda s: s.update(frames=["t1", "t1"]), "each frame once"),
-        (lambda s: s.update(frames=["../t1"]), "file names without their type"),
+        (lambda s: s.update(frames=["../t1"]), "a name of letters"),
         (lambda s: s.update(cuts=["t1"]), "pairs of frame ids"),
         (lambda s: s.update(cuts=[["1", "2"]]), "cuts: expected pairs of ids that are in frames, found '1'"),
         (lambda s: s.update(cuts=[["t2", "t1"]]), "cut 0: expected .* found .2, 1."),
