@@ -73,6 +73,11 @@ def test_cuts_divide_all_frames_whether_they_are_used_or_not(capture):
     assert read_splits(capture).segments == [(0, 1)]
 
 
+def test_frames_in_contact_may_be_noted(capture):
+    edit(capture / "splits.json", lambda s: s.update(contact={"t1": True}))
+    assert read_splits(capture).frames == [f"t{i}" for i in range(5)]
+
+
 def test_cuts_divide_runs(capture):
     edit(capture / "splits.json", lambda s: s.update(cuts=[["t1", "t2"]]))
     plan = plan_capture(open_capture(capture), **{**CHOICE, "test_fraction": 0.4})
