@@ -20,6 +20,7 @@ __all__ = ["SOCKET_VARIABLE", "VERBS", "main"]
 VERBS = {
     "synthesize": "write a complete synthetic dataset in Decaf's layout, body models included",
     "check": "validate a capture (or a Decaf folder) and draw meshes over its images",
+    "import": "data of VHAP, nerfstudio, COLMAP, or mesh files -> a capture",
     "ingest": "one camera's video or image folder -> frame pack",
     "tracks": "a subject's parameters, keypoints and meshes -> one mesh sequence",
     "masks": "person matte + meshes -> head and hand labels and coverage",

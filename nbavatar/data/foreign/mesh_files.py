@@ -1,0 +1,142 @@
+"""Sequences of mesh files: one OBJ or PLY a frame and part, the same faces in all of them.
+
+DIR/<frame>.obj                     the head
+DIR/<part>/<frame>.obj              head, right_hand, left_hand: whichever there are
+DIR/[<part>/]rest.obj               optional: the part at rest
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from nbavatar.data.foreign.source import Meshes, natural
+from nbavatar.data.sequences import PARTS
+from nbavatar.errors import DataError
+from nbavatar.io.meshfiles import MESH_TYPES, read_mesh_file
+from nbavatar.mesh.repair import repair_faces
+
+__all__ = ["JoinedMeshes", "MeshFiles", "find_mesh_files"]
+
+_REST = "rest"
+
+
+class MeshFiles:
+    """The meshes of some files.
+
+    Args:
+        files: part -> frame -> file.
+        rest: part -> file of the part at rest.
+        scale: metres per unit of the files.
+        repair: mend the faces of the first frame (see `repair_faces`), for all frames alike.
+
+    Raises:
+        DataError: a file is damaged, or its faces are not those of the part's first frame.
+    """
+
+    def __init__(
+        self, files: Mapping[str, Mapping[str, Path]], *, rest: Mapping[str, Path] | None = None, scale: float = 1.0,
+        repair: bool = False,
+    ) -> None:  # fmt: skip
+        self._files, self._scale = {part: dict(frames) for part, frames in files.items()}, scale
+        self._rest: dict[str, np.ndarray | None] = {}
+        self._stored: dict[str, np.ndarray] = {}  # faces as they are in the files
+        self._faces: dict[str, np.ndarray] = {}
+        self._counts: dict[str, int] = {}
+        self.notes: list[str] = []
+        for part, frames in self._files.items():
+            first = next(iter(frames.values()))
+            verts, faces = read_mesh_file(first)
+            self._stored[part] = self._faces[part] = faces
+            self._counts[part] = len(verts)
+            if repair:
+                self._faces[part], said = repair_faces(verts, faces)
+                self.notes.extend(f"{first}: {line}" for line in said)
+            path = (rest or {}).get(part)
+            self._rest[part] = None if path is None else self._read(part, path)
+
+    def topology(self) -> Mapping[str, tuple[np.ndarray, np.ndarray | None]]:
+        """See `Meshes`."""
+        return {part: (self._faces[part], self._rest[part]) for part in self._files}
+
+    def vertices(self, frame: str) -> Mapping[str, np.ndarray]:
+        """See `Meshes`."""
+        result = {}
+        for part, files in self._files.items():
+            path = matching(frame, files)
+            if path is not None:
+                result[part] = self._read(part, path)
+        return result
+
+    def _read(self, part: str, path: Path) -> np.ndarray:
+        verts, faces = read_mesh_file(path)
+        first = next(iter(self._files[part].values()))
+        if len(verts) != self._counts[part]:
+            raise DataError.of(path, "vertices", expected=f"{self._counts[part]} as in {first}", found=len(verts))
+        if not np.array_equal(faces, self._stored[part]):
+            raise DataError.of(
+                path, "faces", expected=f"those of {first}, in their order", found="others",
+                fix="all frames need one topology; remesh none of them on its own",
+            )  # fmt: skip
+        return (verts * self._scale).astype(np.float32)
+
+
+class JoinedMeshes:
+    """Meshes of several sources, such as a tracked head and hands from files."""
+
+    def __init__(self, sources: Sequence[Meshes]) -> None:
+        self._sources = sources
+
+    def topology(self) -> Mapping[str, tuple[np.ndarray, np.ndarray | None]]:
+        """See `Meshes`."""
+        result: dict[str, tuple[np.ndarray, np.ndarray | None]] = {}
+        for source in self._sources:
+            result |= source.topology()
+        return {part: result[part] for part in PARTS if part in result}
+
+    def vertices(self, frame: str) -> Mapping[str, np.ndarray]:
+        """See `Meshes`."""
+        return {part: verts for source in self._sources for part, verts in source.vertices(frame).items()}
+
+
+def find_mesh_files(folder: Path, *, scale: float = 1.0, repair: bool = False) -> MeshFiles:
+    """The sequences of a folder; see the module for its layout.
+
+    Raises:
+        DataError: no mesh there, or a damaged one.
+    """
+    if not folder.is_dir():
+        raise DataError.of(folder, expected="a folder of meshes", found="no such folder")
+    files = {part: _listed(folder / part) for part in PARTS if (folder / part).is_dir()}
+    direct = _listed(folder)
+    if direct and "head" in files:
+        raise DataError.of(folder, expected="heads here or in head/", found="meshes in both")
+    if direct:
+        files["head"] = direct
+    rest = {part: frames.pop(_REST) for part, frames in files.items() if _REST in frames}
+    files = {part: files[part] for part in PARTS if files.get(part)}
+    if not files:
+        raise DataError.of(
+            folder, expected=f"<frame>{' or <frame>'.join(MESH_TYPES)}, here or in {', '.join(PARTS)}", found="none"
+        )
+    return MeshFiles(files, rest=rest, scale=scale, repair=repair)
+
+
+def matching(frame: str, files: Mapping[str, Path]) -> Path | None:
+    """The file of a frame: of its name, or of the same number with other zero padding."""
+    if frame in files:
+        return files[frame]
+    if not frame.isdecimal():
+        return None
+    return next((path for name, path in files.items() if name.isdecimal() and int(name) == int(frame)), None)
+
+
+def _listed(folder: Path) -> dict[str, Path]:
+    """Stem -> mesh of a folder, in natural order."""
+    found = sorted((p for p in folder.iterdir() if p.suffix.lower() in MESH_TYPES), key=lambda path: natural(path.stem))
+    files: dict[str, Path] = {}
+    for path in found:
+        if path.stem in files:
+            raise DataError.of(path, expected="one mesh a frame", found=f"{files[path.stem].name} too")
+        files[path.stem] = path
+    return files
