@@ -13,7 +13,7 @@ from typing import Any
 from nbavatar.errors import ConfigError, DataError, describe, did_you_mean
 from nbavatar.names import check_name
 
-__all__ = ["StoredCamera", "choose_camera", "parse_camera", "read_rig"]
+__all__ = ["StoredCamera", "choose_camera", "parse_camera", "read_rig", "stored_test_camera"]
 
 _NEEDED = ("width", "height", "K", "R", "t")
 _OPTIONAL = ("distortion", "camera_model")
@@ -159,6 +159,27 @@ def choose_camera(wanted: str | int, names: Sequence[str] | Mapping[str, Any], w
         fix = "write the camera's name in quotes, as text"
         raise ConfigError.of(where, expected=f"one camera that {wanted} can mean", found=found, fix=fix)
     return meant[0]
+
+
+def stored_test_camera(folder: str | os.PathLike[str], names: Sequence[str] | Mapping[str, Any]) -> str:
+    """The camera that a capture itself holds out: `test_camera` of its `splits.json`, empty where it names none.
+
+    Raises:
+        DataError: the file is no JSON, or the camera is none of `names`.
+    """
+    path = os.path.join(folder, "splits.json")
+    try:
+        with open(path, encoding="utf-8-sig") as stream:
+            stored = json.load(stream)
+    except FileNotFoundError:
+        return ""
+    except (ValueError, RecursionError) as error:
+        raise DataError.of(path, expected="JSON", found=f"text that does not parse ({error})") from error
+    camera = stored.get("test_camera", "") if isinstance(stored, dict) else ""
+    if camera != "" and camera not in list(names):
+        found, fix = describe(camera), did_you_mean(str(camera), names)
+        raise DataError.of(path, "test_camera", expected="a camera of cameras.json", found=found, fix=fix)
+    return camera
 
 
 def _readings(name: str) -> set[int]:

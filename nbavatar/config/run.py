@@ -80,7 +80,8 @@ class RunConfig:
     subjects: str = option("config/subjects.tsv", "Sheet of subjects and cameras; not used by the capture layout.")
     test_camera: str | int = option(
         "",
-        "Capture layout: camera to hold out (084 and 84 mean the same); empty for the one best surrounded by others.",
+        "Capture layout: camera to hold out (084 and 84 mean the same); empty for the one that its splits.json names, "
+        "or else the one best surrounded by others.",
     )
     runs: str = option("config/runs.tsv", "Sheet of what to make: subject, variant, protocol.")
     tables: str = option("config/tables.yaml", "Layout of the tables.")

@@ -10,7 +10,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from nbavatar.config.cameras import choose_camera, parse_camera, read_rig
+from nbavatar.config.cameras import choose_camera, parse_camera, read_rig, stored_test_camera
 from nbavatar.errors import ConfigError, DataError, did_you_mean
 from nbavatar.names import check_name, check_place, name_like
 
@@ -71,8 +71,9 @@ def capture_subjects(root: str, test_camera: str | int) -> dict[str, Subject]:
 
     Args:
         root: folder of one capture, or of several.
-        test_camera: camera to hold out (a number where its id is one); empty for the one whose two nearest neighbours
-            are nearest (by the farther of the two), so that the judged view lies between training views.
+        test_camera: camera to hold out (a number where its id is one); empty for the one that `splits.json` names, or
+            else the one whose two nearest neighbours are nearest (by the farther of the two), so that the judged view
+            lies between training views.
     """
     base = Path(root)
     folders = [base] if (base / "cameras.json").is_file() else sorted(base.glob("*/cameras.json"))
@@ -89,12 +90,14 @@ def capture_subjects(root: str, test_camera: str | int) -> dict[str, Subject]:
         check_place(str(folder), folder, "name of the folder", error=ConfigError)
         try:
             rig = {name: parse_camera(name, entry, path) for name, entry in read_rig(path).items()}
+            own = stored_test_camera(folder, rig)
         except DataError as error:
             raise ConfigError(str(error)) from error
         centres = {name: camera.centre for name, camera in rig.items()}
         if len(centres) < 2:
             raise ConfigError.of(path, expected="two cameras or more", found=len(centres))
-        held_out = _best_surrounded(centres) if test_camera == "" else choose_camera(test_camera, rig, "test_camera")
+        wanted = own if test_camera == "" else choose_camera(test_camera, rig, "test_camera")
+        held_out = wanted or _best_surrounded(centres)
         train = tuple(sorted(set(centres) - {held_out}))
         name = check_name(name_like(folder.resolve().name), folder, "name of the folder", error=ConfigError)
         if name in subjects:

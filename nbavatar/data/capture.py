@@ -6,7 +6,8 @@
     alpha/<camera>/<frame>.png         optional coverage, 8 bit
     meshes/topology.npz                head_faces, right_hand_faces, left_hand_faces: any subset [, <part>_rest]
     meshes/<frame>.npz                 head, right_hand, left_hand [m]; optional head_rigid, the head without contact
-    splits.json                        frames [, train, test, cuts] [, contact: frame -> true or false, for people only]
+    splits.json                        frames [, train, test, cuts, test_camera] [, contact: frame -> true or false, for
+                                       people only]
 
 Lengths are metres, world axes any, pixel centres at +0.5. Every reader raises `DataError` with one line.
 """
@@ -43,7 +44,7 @@ __all__ = [
     "read_topology",
 ]
 
-_SPLITS = ("frames", "train", "test", "cuts", "contact")
+_SPLITS = ("frames", "train", "test", "cuts", "test_camera", "contact")
 _TYPES = (".jpg", ".jpeg", ".png", ".webp")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nbavatar.camera.pinhole import Camera
-from nbavatar.config.cameras import read_rig
+from nbavatar.config.cameras import read_rig, stored_test_camera
 from nbavatar.data.capture import (
     Capture,
     camera_of,
@@ -100,6 +100,8 @@ def check_capture(
         report.capture = Capture(root, cameras)
     if splits is not None:
         report.frames = splits.frames
+        if cameras:
+            found.attempt("test camera", lambda: stored_test_camera(root, read_rig(root / "cameras.json")))
         _note_on_order(root, splits.frames, report)
     meshes = _check_meshes(root, report, found) if report.topology and report.frames else {}
     for camera in cameras.values():

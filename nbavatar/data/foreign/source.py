@@ -1,8 +1,8 @@
 """What an importer hands over, whatever the format: pictures with calibrations, meshes, who is held out.
 
 A source is a list of shots, one picture each. `grid` sorts them into the cameras and frames of a capture. Paths that
-a source's files name are followed within one folder only (`inside`), and names that become file names are made of
-letters, digits and `. _ -` (`safe_names`): nothing in a source decides where a file is written.
+a source's files name are followed within one folder only (`inside`), and names that become file names follow the
+project's rule (`safe_names`): nothing in a source decides where a file is written.
 """
 
 import dataclasses
@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from nbavatar.errors import DataError
+from nbavatar.names import check_name, name_like
 
 __all__ = ["Lens", "Meshes", "Shot", "Source", "grid", "inside", "natural", "one_lens", "picture", "safe_names"]
 
@@ -161,7 +162,7 @@ def natural(name: str) -> tuple[Any, ...]:
 
 
 def safe_names(names: Iterable[str], where: object, kind: str) -> dict[str, str]:
-    """What names are called in a capture: letters and digits of any script and `_ - .`, no leading dot or dash.
+    """What the source's names are called in a capture (see `nbavatar.names`).
 
     Raises:
         DataError: two names become one, or nothing is left of one.
@@ -169,15 +170,14 @@ def safe_names(names: Iterable[str], where: object, kind: str) -> dict[str, str]
     result: dict[str, str] = {}
     taken: dict[str, str] = {}
     for name in names:
-        safe = re.sub(r"[^\w.-]", "_", name).lstrip(".-")
+        safe = name_like(name)
         if not safe.strip("_.-"):
-            raise DataError.of(
-                where, f"{kind} {name!r}", expected="a name with letters or digits", found="none of them"
-            )
+            found = "none"
+            raise DataError.of(where, f"{kind} {name!r}", expected="a name with letters or digits", found=found)
         if safe in taken:
             raise DataError.of(where, f"{kind} {name!r}", expected="another name", found=f"that of {taken[safe]!r}")
         taken[safe] = name
-        result[name] = safe
+        result[name] = check_name(safe, where, kind, error=DataError)
     return result
 
 

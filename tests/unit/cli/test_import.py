@@ -10,6 +10,7 @@ from PIL import Image
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import project
 from nbavatar.cli import main
+from nbavatar.config.sheets import capture_subjects
 from nbavatar.data.capture import open_capture, read_mesh, read_splits, read_topology
 from nbavatar.data.capture_check import check_capture
 from nbavatar.io.meshfiles import read_mesh_file
@@ -66,6 +67,8 @@ def test_vhap_with_parameters(tmp_path, flame, capfd, teeth):
     splits = json.loads((out / "splits.json").read_text())
     assert splits["train"] == ["00000", "00001", "00002", "00003"] and splits["test"] == ["00004"]
     assert splits["test_camera"] == "222200037" and "cuts" not in splits
+    held_out = capture_subjects(str(out), "")["me"]
+    assert held_out.test_camera == "222200037" and held_out.train_cameras == ("222200036", "222200038")
     for folder, theirs in (("images", "images"), ("masks", "fg_masks")):
         for index, camera in enumerate(foreign.CAMERAS):
             ours = (out / folder / camera / "00002.png").read_bytes()

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from nbavatar.config.cameras import parse_camera, read_rig
+from nbavatar.config.cameras import parse_camera, read_rig, stored_test_camera
 from nbavatar.errors import DataError
 
 GOOD = {
@@ -97,3 +97,17 @@ def test_a_byte_order_mark_is_skipped(tmp_path):
     path = tmp_path / "cameras.json"
     path.write_bytes(b"\xef\xbb\xbf" + json.dumps({"left": GOOD}).encode())
     assert read_rig(path) == {"left": GOOD}
+
+
+def test_a_capture_may_name_the_camera_that_is_held_out(tmp_path):
+    names = ["a", "b"]
+    assert stored_test_camera(tmp_path, names) == ""
+    (tmp_path / "splits.json").write_text('\ufeff{"frames": [], "test_camera": "b"}', encoding="utf-8")
+    assert stored_test_camera(tmp_path, names) == "b"
+    for wrong in ('"c"', "1", "[]", "null", '["a"]', "{}"):
+        (tmp_path / "splits.json").write_text(f'{{"test_camera": {wrong}}}')
+        with pytest.raises(DataError, match=r"splits.json: test_camera: expected a camera of cameras.json"):
+            stored_test_camera(tmp_path, names)
+    (tmp_path / "splits.json").write_text("{")
+    with pytest.raises(DataError, match="expected JSON"):
+        stored_test_camera(tmp_path, names)
