@@ -5,8 +5,10 @@ line, with exit code 2 and no traceback. Anything else that escapes is a defect
 of ours and keeps its traceback.
 """
 
+import contextlib
 import importlib
-from collections.abc import Iterable
+import reprlib
+from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 from types import ModuleType
 from typing import Any, Self
@@ -19,12 +21,19 @@ __all__ = [
     "NBAvatarError",
     "describe",
     "did_you_mean",
+    "parsing",
     "require",
 ]
 
 
 class NBAvatarError(Exception):
-    """Base of all errors whose cause lies outside the program."""
+    """Base of all errors whose cause lies outside the program.
+
+    Names and values in the text come from files; what a terminal would obey instead of showing is written out.
+    """
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__("".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text))
 
     @classmethod
     def of(cls, where: object, field: str = "", *, expected: object, found: object, fix: str = "") -> Self:
@@ -58,9 +67,61 @@ class DeviceError(NBAvatarError):
     """The device that was asked for is not there or too small."""
 
 
+@contextlib.contextmanager
+def parsing(
+    where: object,
+    expected: str,
+    *,
+    field: str = "",
+    damaged: str = "a damaged one",
+    fix: str = "",
+    error: type[NBAvatarError] = DataError,
+) -> Iterator[None]:
+    """Translates whatever is raised while a file is opened and parsed into the one line that names it.
+
+    Parsers raise nearly anything on damaged content, from `zlib.error` to `RecursionError`, so no list of kinds would
+    be complete. The block should hold the parsing and nothing else: a defect of ours inside it would be told as the
+    file's.
+
+    Args:
+        where: the file.
+        expected: what it should be.
+        field: part of the file that is parsed.
+        damaged: what to call a file that does not parse; the parser's own words follow in brackets.
+        fix: what the user should do.
+        error: class of the error.
+
+    Raises:
+        NBAvatarError: of the class `error`; one that the block raises itself passes unchanged.
+    """
+    try:
+        yield
+    except (NBAvatarError, NameError, ImportError):  # ours to mend, or a package that is missing
+        raise
+    except FileNotFoundError as cause:
+        raise error.of(where, field, expected=expected, found="no such file") from cause
+    except OSError as cause:
+        found = f"one that cannot be read: {cause.strerror}" if cause.strerror else f"{damaged} ({_reason(cause)})"
+        raise error.of(where, field, expected=expected, found=found, fix=fix) from cause
+    except Exception as cause:
+        raise error.of(where, field, expected=expected, found=f"{damaged} ({_reason(cause)})", fix=fix) from cause
+
+
+def _reason(cause: Exception) -> str:
+    """Why a parser gave up, in one short line."""
+    if isinstance(cause, KeyError):
+        return f"no entry {describe(cause.args[0])}" if cause.args else "an entry is missing"
+    if isinstance(cause, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(cause, MemoryError):
+        return "it asks for more memory than there is"
+    text = " ".join(str(cause).split())
+    return text if 0 < len(text) <= 200 else text[:197] + "..." if text else type(cause).__name__
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Returns a hint such as `did you mean 'steps'?`, or the list of known words."""
-    names = sorted(known)
+    names = sorted(map(str, known))
     near = get_close_matches(word, names, n=1)
     return f"did you mean '{near[0]}'?" if near else f"known: {', '.join(names)}"
 
@@ -87,6 +148,13 @@ def require(module: str, package: str, why: str) -> ModuleType:
 
 
 def describe(value: Any) -> str:
-    """Short text of a value for error lines."""
-    text = repr(value)
+    """Short text of a value for error lines; a value that refers to its parts many times over stays short too."""
+    text = _REPR.repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
+
+
+# A few hundred bytes of YAML or pickle may stand for a value whose whole text would never end.
+_REPR = reprlib.Repr()
+_REPR.maxlevel = 4
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = 160
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozenset = 12

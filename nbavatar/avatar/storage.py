@@ -1,6 +1,7 @@
 """One file that holds an avatar, whatever its kind, and the list of kinds.
 
-`model.pt` opens with ``torch.load(..., weights_only=True)``: tensors, numbers and text, nothing executable.
+`model.pt` opens with ``torch.load(..., weights_only=True)``: tensors, numbers and text, nothing executable. Here it is
+read by `nbavatar.io.tensors`, which also compares every size with the bytes that are there.
 """
 
 import importlib
@@ -12,8 +13,9 @@ import torch
 from torch import Tensor
 
 from nbavatar.avatar.base import MeshAvatar
-from nbavatar.errors import DataError
+from nbavatar.errors import DataError, describe, parsing
 from nbavatar.io.atomic import atomic_write
+from nbavatar.io.tensors import read_tensors
 
 __all__ = ["FORMAT", "METHODS", "MethodModules", "load_avatar", "resolve", "save_avatar"]
 
@@ -73,28 +75,17 @@ def load_avatar(path: str | os.PathLike[str], device: str | torch.device = "cpu"
     Raises:
         DataError: missing, damaged, not an avatar, of another format version, or of a method that is not known.
     """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="an avatar (model.pt)", found="no such file") from error
-    except Exception as error:  # torch raises many kinds for damaged and for hostile files
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DataError.of(
-            path, expected="an avatar (model.pt)", found=f"a damaged or foreign file ({reason})"
-        ) from error
+    content = read_tensors(path, "an avatar (model.pt)")
     if not isinstance(content, dict) or content.get("kind") != _KIND:
         raise DataError.of(path, "kind", expected=f"'{_KIND}'", found="something else")
-    if content["format"] != FORMAT:
-        raise DataError.of(
-            path, "format", expected=FORMAT, found=content["format"], fix="train it again with this version"
-        )
+    if content.get("format") != FORMAT:
+        found = describe(content.get("format"))
+        raise DataError.of(path, "format", expected=FORMAT, found=found, fix="train it again with this version")
     method = content.get("method", "billboards")
-    if method not in METHODS:
-        raise DataError.of(path, "method", expected=f"one of {', '.join(METHODS)}", found=method)
-    try:
+    if not isinstance(method, str) or method not in METHODS:
+        raise DataError.of(path, "method", expected=f"one of {', '.join(METHODS)}", found=describe(method))
+    with parsing(path, "a whole avatar", damaged="contents that disagree"):
         state: dict[str, Tensor] = content["state"]
         avatar: MeshAvatar = resolve(METHODS[method].avatar).rebuild(content, state, json.loads(content["record"]))
         avatar.restore({**state, "faces": avatar.faces})
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise DataError.of(path, expected="a whole avatar", found=f"contents that disagree ({error})") from error
     return avatar.to(device).eval()

@@ -2,17 +2,20 @@
 
 import json
 import os
+import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
-from typing import Any
+from math import prod
+from typing import IO, Any
 
 import numpy as np
 
-from nbavatar.errors import DataError
+from nbavatar.errors import DataError, parsing
+from nbavatar.io.archives import open_archive
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.records import canonical_json
 
-__all__ = ["read_arrays", "write_arrays"]
+__all__ = ["read_array_header", "read_arrays", "read_plain_array", "write_arrays"]
 
 _RECORD = "record.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -47,19 +50,48 @@ def read_arrays(
     Raises:
         DataError: the file is missing or damaged, or an array of `required` is not in it.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            arrays = {}
-            for entry in archive.namelist():
-                if entry.endswith(".npy"):
-                    with archive.open(entry) as stream:
-                        arrays[entry[:-4]] = np.lib.format.read_array(stream, allow_pickle=False)
-            record = json.loads(archive.read(_RECORD)) if _RECORD in archive.namelist() else {}
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="an array file (.npz)", found="no such file") from error
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError) as error:
-        raise DataError.of(path, expected="an array file (.npz)", found=f"a damaged one ({error})") from error
+    with parsing(path, "an array file (.npz)"), open_archive(path) as archive:
+        arrays = {}
+        for entry in archive.infolist():
+            if entry.filename.endswith(".npy"):
+                with archive.open(entry) as stream:
+                    arrays[entry.filename[:-4]] = read_plain_array(stream, entry.file_size)
+        record = json.loads(archive.read(_RECORD)) if _RECORD in archive.namelist() else {}
+        if not isinstance(record, dict):
+            raise ValueError(f"{_RECORD} is no record")
     for name in required:
         if name not in arrays:
             raise DataError.of(path, name, expected="an array of this name", found=f"only {', '.join(sorted(arrays))}")
     return arrays, record
+
+
+def read_array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, Fortran order and dtype of a `.npy` stream, which is left where the numbers begin.
+
+    Raises:
+        ValueError: no header of the formats 1.0 to 3.0.
+    """
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"format {version[0]}.{version[1]} of .npy files")
+    # The reader of 2.0 takes 3.0 as well, up to names of fields, which none of ours have.
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the header is parsed as Python; damaged ones make its parser talk
+        return read(stream)
+
+
+def read_plain_array(stream: IO[bytes], size: int) -> np.ndarray:
+    """The array of a `.npy` stream of `size` bytes, which can be rewound; what its header claims must be there.
+
+    Raises:
+        ValueError: damaged, an array of objects, or fewer or more bytes than shape and dtype ask for.
+    """
+    shape, _, dtype = read_array_header(stream)
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects")
+    claimed, there = prod(shape) * dtype.itemsize, size - stream.tell()
+    if claimed != there or min(shape, default=0) < 0:
+        raise ValueError(f"shape {shape} of {dtype} in {there} bytes")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)

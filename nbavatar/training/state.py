@@ -21,11 +21,12 @@ from typing import IO, Any
 import numpy as np
 import torch
 
-from nbavatar.errors import DataError
+from nbavatar.errors import DataError, parsing
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.eventfile import EventFile
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import canonical_json, write_json
+from nbavatar.io.tensors import read_tensors
 
 __all__ = ["RunFolder"]
 
@@ -89,15 +90,11 @@ class RunFolder:
         if not file.exists():
             self._rewrite_events([])
             return None
-        try:
-            state = torch.load(file, map_location="cpu", weights_only=True)
-        except Exception as error:  # torch raises many kinds
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise DataError.of(
-                file, expected="a training state", found=f"a damaged file ({reason})", fix=f"delete {self.path}"
-            ) from error
-        self._rewrite_events([event for event in self.events() if event.get("step", 0) <= state["step"]])
-        self._first = state["step"] + 1
+        state = read_tensors(file, "a training state", fix=f"delete {self.path}")
+        with parsing(file, "a training state", fix=f"delete {self.path}"):
+            step = int(state["step"])
+        self._rewrite_events([event for event in self.events() if event.get("step", 0) <= step])
+        self._first = step + 1
         return state
 
     def save(self, state: Mapping[str, Any]) -> None:

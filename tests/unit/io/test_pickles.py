@@ -4,6 +4,7 @@ import collections
 import io
 import os
 import pickle
+import subprocess
 import sys
 import types
 
@@ -206,21 +207,123 @@ def test_array_of_huge_initial_shape_is_refused(tmp_path):
         read_pickle(_write(tmp_path / "h.pkl", content))
 
 
-def test_self_reference_survives(tmp_path):
+def test_self_reference_is_refused(tmp_path):
+    """Nothing that is converted to arrays or printed may go round in circles."""
     value: list = [1]
-    value.append(value)
-    found = read_pickle(_write(tmp_path / "s.pkl", value))
-    assert found[1] is found
+    value.append({"again": (value, value)})
+    with pytest.raises(DataError, match="a container that holds itself"):
+        read_pickle(_write(tmp_path / "s.pkl", value))
 
 
 def test_missing_and_foreign_files(tmp_path):
-    for reader in (read_pickle, read_array):
-        with pytest.raises(DataError, match="readable file"):
+    for reader, expected in ((read_pickle, "readable file"), (read_array, "a numpy .npy file")):
+        with pytest.raises(DataError, match=f"{expected}.*found no such file"):
             reader(tmp_path / "none")
+        with pytest.raises(DataError, match="cannot be read: Is a directory"):
+            reader(tmp_path)
         with pytest.raises(DataError):
             reader(_write(tmp_path / "x", b"GIF89a not a pickle"))
         with pytest.raises(DataError):
             reader(_write(tmp_path / "x", b""))
+
+
+def _levels(make, count=30):
+    value = make(0, 0)
+    for _ in range(count):
+        value = make(value, value)
+    return value
+
+
+def _chains_of_selects(ch, select, count):
+    """Selections of selections, twenty in a chain, each of which asks for a fresh megabyte."""
+    source, index = ch.__new__(ch), np.zeros(1 << 17, dtype=np.int64)
+    source.__dict__.update(x=np.zeros(8))
+    chains = []
+    for _ in range(count):
+        last = source
+        for _ in range(20):
+            node = select.__new__(select)
+            node.__dict__.update(a=last, idxs=index, preferred_shape=None)
+            last = node
+        chains.append(last)
+    return chains
+
+
+class _Call:
+    def __init__(self, call, *args):
+        self.pair = (call, args)
+
+    def __reduce__(self):
+        return self.pair
+
+
+_TUPLES = b"K\x00" + 60 * b"2\x86"  # DUP TUPLE2: ((((0, 0), (0, 0)), ...
+
+BOMBS = {
+    # A tuple's hash is not remembered: twice the time for every level, ages for 130 bytes.
+    "hash of a key": lambda: b"\x80\x02}" + _TUPLES + b"K\x01s.",
+    "hash of a set's item": lambda: b"\x80\x04(" + _TUPLES + b"\x91.",
+    "hash of a set's item, called": lambda: b"\x80\x02c__builtin__\nfrozenset\n]" + _TUPLES + b"a\x85R.",
+    "colliding keys": lambda: pickle.dumps({k * (2**61 - 1): 0 for k in range(1, 2000)}, protocol=2),
+    "nested lists": lambda: pickle.dumps({"R": _levels(lambda a, b: [a, b])}, protocol=2),
+    "nested tuples": lambda: pickle.dumps({"R": _levels(lambda a, b: (a, b))}, protocol=2),
+    "text of nested tuples": lambda: pickle.dumps(_Call(str, _levels(lambda a, b: (a, b))), protocol=2),
+    "shared arrays": lambda: pickle.dumps([_levels(lambda a, b: [a, b], 12), [[np.zeros(1 << 16)] * 4096]], protocol=2),
+    "bytearray of a size": lambda: pickle.dumps(_Call(bytearray, 1 << 40), protocol=2),
+    "bytearray of a claimed length": lambda: b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b"abc.",
+    "text of a claimed length": lambda: b"\x80\x04\x8d" + (1 << 40).to_bytes(8, "little") + b"abc.",
+    "frame of a claimed length": lambda: b"\x80\x04\x95" + (1 << 60).to_bytes(8, "little") + b"abc.",
+    "memo of a claimed size": lambda: b"\x80\x02]r\xff\xff\xff\x7f0\x96.",
+    "many copies of one text": lambda: (
+        b"\x80\x02(X\x00\x00\x10\x00" + b"a" * (1 << 20) + b"q\x000"
+        + b"c_codecs\nencode\nq\x010" + b"h\x01h\x00\x85R" * 2000 + b"l."
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_bombs_are_refused_at_once(tmp_path, name):
+    """Each would take minutes to ages, or more memory than there is; read in a process that may have a gigabyte."""
+    content = BOMBS[name]()
+    assert len(content) < 4_000_000
+    code = (
+        "import resource, sys, numpy, scipy.sparse\n"
+        "from nbavatar.errors import DataError\n"
+        "from nbavatar.io.pickles import read_pickle\n"
+        "used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30),) * 2)\n"
+        "try:\n    read_pickle(sys.argv[1])\n"
+        "except DataError as error:\n    print(error)\n"
+    )
+    _write(tmp_path / "bomb.pkl", content)
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "bomb.pkl"], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert "bomb.pkl: pickle: " in done.stdout, done
+
+
+def test_chains_of_selects_are_refused_when_they_outgrow_their_file(tmp_path, chumpy):
+    ch, select = chumpy
+    few = _write(tmp_path / "few.pkl", _chains_of_selects(ch, select, 2))
+    many = _write(tmp_path / "many.pkl", _chains_of_selects(ch, select, 30))
+    for name in ("chumpy", "chumpy.ch", "chumpy.reordering"):
+        del sys.modules[name]
+    assert [array.shape for array in read_pickle(few)] == [(1 << 17,)] * 2
+    assert many.stat().st_size < 1_500_000
+    with pytest.raises(DataError, match="far more memory than the file has bytes"):
+        read_pickle(many)
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+def test_containers_by_call_round_trip(tmp_path, protocol):
+    value = {
+        "set": {1, (2, "x")},
+        "frozen": frozenset([frozenset([3]), 4]),
+        "bytes": bytearray(b"\x00\xff"),
+        "k": (1, 2),
+    }
+    value[(5, "key")] = slice(1, None, 2)
+    assert read_pickle(_write(tmp_path / "c.pkl", value, protocol)) == value
 
 
 _WHOLE = pickle.dumps(
