@@ -9,8 +9,9 @@ Writes a frame pack of the same frames, size and camera (still distorted):
   label     uint8 [H, W]      0 background, 1 head with neck and hair, 2 right hand, 3 left hand (above the wrist)
   alpha     uint8 [H, W]      coverage, 255 = full
 
-Whatever is neither head nor hand (torso, arms) becomes background. Holes and islands that the meshes contradict are
-repaired, and so is what flickers in single frames. The record counts the pixels that each repair changed.
+Whatever is neither head nor hand (torso, arms) becomes background, unless `keep` is `person`. Holes and islands that
+the meshes contradict are repaired, and so is what flickers in single frames. The record counts the pixels that each
+repair changed.
 """
 
 import argparse
@@ -58,7 +59,7 @@ def main(args: argparse.Namespace) -> None:
         lens = None if distortion is None else np.array(distortion, dtype=np.float64)
         camera = Camera(manifest["camera"], manifest["width"], manifest["height"], K, pack.cam_from_world, lens)
         margins = Margins(cfg.hair_margin, cfg.neck_margin, cfg.hand_margin, cfg.forearm_length)
-        cutter = PartCutter(sequence, camera, margins)
+        cutter = PartCutter(sequence, camera, margins, whole=cfg.keep == "person")
         runs = [frames[first : last + 1] for first, last in manifest.get("segments", [[0, len(frames) - 1]])]
         numbers = MaskNumbers(cfg.threshold, cfg.hole_fraction, cfg.island_fraction, cfg.temporal, cfg.soft_alpha)
         statistics = MaskStatistics()
@@ -69,7 +70,7 @@ def main(args: argparse.Namespace) -> None:
         record = run_record("masks", config=to_mapping(cfg), inputs=inputs, extra=extra)
         layers = {name: LAYERS[name] for name in ("label", "alpha")}
         with FramePackWriter(args.out, {**manifest, "stage": "masks", "layers": layers, "record": record}) as out:
-            model = ClothesModel(cfg.clothes_evidence) if cfg.clothes and "rgb" in pack.layers else None
+            model = ClothesModel(cfg.clothes_evidence) if _sorts_clothes(cfg, pack) else None
             cut = cut_masks(
                 masks, cutter, runs, numbers, statistics, images=lambda frame: pack.read("rgb", frame), clothes=model
             )
@@ -77,6 +78,10 @@ def main(args: argparse.Namespace) -> None:
                 out.add("label", frame, label)
                 out.add("alpha", frame, alpha)
             record["pixels"] = dataclasses.asdict(statistics)
+
+
+def _sorts_clothes(cfg: MasksConfig, pack: FramePack) -> bool:
+    return cfg.clothes and cfg.keep == "parts" and "rgb" in pack.layers
 
 
 def _masks(

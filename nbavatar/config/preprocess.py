@@ -58,6 +58,12 @@ class MasksConfig:
         "[<subject>/]<camera>.mp4; labels 0..3, or 0 and 255 for the person, which is then cut by the meshes.",
     )
     threshold: int = option(127, "A matte above this is foreground; mask videos are lossy [0..255].", min=0, max=254)
+    keep: str = option(
+        "parts",
+        "What of a matte is labelled: parts, what the meshes say is head or hand; person, all of it (hair of any "
+        "length, shoulders, arms), as head where no hand is. Billboards start on the meshes all the same.",
+        choices=("parts", "person"),
+    )
     hair_margin: float = option(0.06, "How far hair may stand off the scalp of the head mesh [m].", min=0.0)
     neck_margin: float = option(0.012, "How far the neck and the jaw may stand off the mesh [m].", min=0.0)
     hand_margin: float = option(0.008, "How far the hand may stand off the mesh [m].", min=0.0)

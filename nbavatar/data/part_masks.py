@@ -77,10 +77,12 @@ class PartCutter:
         sequence: posed meshes; parts that are absent are not looked for.
         camera: its size, matrix and distortion are those of the mattes.
         margins: see `Margins`.
+        whole: whether what the meshes do not claim is kept too, as head (or the first part there is).
     """
 
-    def __init__(self, sequence: MeshSequence, camera: Camera, margins: Margins) -> None:
+    def __init__(self, sequence: MeshSequence, camera: Camera, margins: Margins, *, whole: bool = False) -> None:
         self._sequence, self._camera = sequence, camera
+        self._others = np.uint8(LABELS[next(iter(sequence.parts))] if whole else 0)
         corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], dtype=np.float64)
         self._reach = float(np.linalg.norm((corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], axis=1).max() * 1.1)
         self._borders: dict[str, np.ndarray] = {}
@@ -164,7 +166,8 @@ class PartCutter:
         """Labels uint8 `[H, W]` of the foreground of one grey matte, not yet cleaned."""
         person = threshold_matte(matte, threshold)
         inside = cv2.distanceTransform(person.astype(np.uint8), cv2.DIST_L2, 5)
-        return np.where(person & (inside <= silhouettes.rim), silhouettes.nearest, np.uint8(0))
+        label = np.where(person & (inside <= silhouettes.rim), silhouettes.nearest, np.uint8(0))
+        return np.where(person & (label == 0), self._others, label)
 
 
 def _border(rest: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
