@@ -19,6 +19,7 @@ __all__ = [
     "DependencyError",
     "DeviceError",
     "NBAvatarError",
+    "StorageError",
     "describe",
     "did_you_mean",
     "parsing",
@@ -117,6 +118,10 @@ def _reason(cause: Exception) -> str:
         return "it asks for more memory than there is"
     text = " ".join(str(cause).split())
     return text if 0 < len(text) <= 200 else text[:197] + "..." if text else type(cause).__name__
+
+
+class StorageError(NBAvatarError):
+    """There is no room for a result: the disk is full, a quota is used up, a file grew beyond a limit."""
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.unit.disks import small_disk  # noqa: F401
+from tests.unit.users import public_folder  # noqa: F401
+
 settings.register_profile(
     "nbavatar",
     deadline=None,

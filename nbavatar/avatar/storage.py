@@ -65,8 +65,9 @@ def save_avatar(path: str | os.PathLike[str], avatar: MeshAvatar) -> None:
         "state": {name: value.detach().cpu().clone() for name, value in avatar.state_dict().items() if name != "faces"},
         **avatar.content(),
     }
-    with atomic_write(path) as temporary:
-        torch.save(content, temporary)
+    # Into a stream, whose errors are the system's: torch's own writer does not name them.
+    with atomic_write(path) as temporary, open(temporary, "wb") as stream:
+        torch.save(content, stream)
 
 
 def load_avatar(path: str | os.PathLike[str], device: str | torch.device = "cpu") -> Any:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from nbavatar.benchmarks.raster_scene import RasterScene, make_scene
+from nbavatar.io.atomic import atomic_write
 
 __all__ = ["RANGES", "sweep"]
 
@@ -45,8 +46,7 @@ def sweep(
             settings: dict[str, Any] = {name: value}
             figures = measure(make_scene(state=state, **settings).to(device), order, repeats)
             rows.append({"swept": name, "value": value, **figures})
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "raster_sweep.csv", "w", newline="") as handle:
+    with atomic_write(folder / "raster_sweep.csv") as temporary, open(temporary, "w", newline="") as handle:
         writer = csv.DictWriter(handle, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
@@ -81,5 +81,6 @@ def _plot(path: Path, rows: list[dict[str, Any]], ranges: dict[str, list[int]]) 
     axes[0, 0].set_ylabel("time [ms]")
     axes[0, 0].legend()
     axes[1, 0].legend()
-    figure.savefig(path, dpi=120)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=120)
     plt.close(figure)

@@ -20,6 +20,8 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from nbavatar.io.atomic import storage_errors
+
 __all__ = ["EventFile", "crc32c"]
 
 _POLYNOMIAL = 0x82F63B78  # reflected
@@ -76,7 +78,7 @@ class EventFile:
 
     def _write(self, data: bytes) -> None:
         length = struct.pack("<Q", len(data))
-        with open(self.path, "ab") as stream:
+        with storage_errors(self.path), open(self.path, "ab") as stream:
             stream.write(length + _masked(length) + data + _masked(data))
 
 

@@ -10,13 +10,12 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nbavatar.errors import DataError, require
-from nbavatar.io.atomic import atomic_write
+from nbavatar.errors import DataError, StorageError, require
+from nbavatar.io.atomic import atomic_write, storage_errors, temporary_beside
 from nbavatar.io.records import canonical_json
 
 __all__ = ["half_error", "read_vertex_maps", "write_vertex_maps"]
@@ -46,19 +45,30 @@ def write_vertex_maps(
         "record": dict(record),
     }
     with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-        with tempfile.TemporaryDirectory(dir=Path(temporary).parent) as folder:
-            for name, values in maps.items():
-                if values.dtype != np.float32 or values.ndim != 3 or values.shape[2] != 3:
-                    raise TypeError(f"'{name}' must be float32 [N, V, 3], got {values.dtype} {list(values.shape)}")
-                layout["maps"][name] = {"vertices": values.shape[1], "rows": _ROWS, "half_error": half_error(values)}
-                for first in range(0, len(values), _ROWS):
-                    file = Path(folder) / "image.exr"
-                    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-                    pixels = np.ascontiguousarray(values[first : first + _ROWS])
-                    with openexr.File(header, {"RGB": pixels}) as image:
-                        image.write(str(file))
-                    archive.writestr(zipfile.ZipInfo(f"{name}.{first:06d}.exr", _EPOCH), file.read_bytes())
+        for name, values in maps.items():
+            if values.dtype != np.float32 or values.ndim != 3 or values.shape[2] != 3:
+                raise TypeError(f"'{name}' must be float32 [N, V, 3], got {values.dtype} {list(values.shape)}")
+            layout["maps"][name] = {"vertices": values.shape[1], "rows": _ROWS, "half_error": half_error(values)}
+            for first in range(0, len(values), _ROWS):
+                content = _image(openexr, path, np.ascontiguousarray(values[first : first + _ROWS]))
+                archive.writestr(zipfile.ZipInfo(f"{name}.{first:06d}.exr", _EPOCH), content)
         archive.writestr(zipfile.ZipInfo("manifest.json", _EPOCH), canonical_json(layout))
+
+
+def _image(openexr: Any, path: str | os.PathLike[str], pixels: np.ndarray) -> bytes:
+    """One image as a file's contents, by way of a file beside the target: OpenEXR writes to named files only."""
+    scratch = temporary_beside(path)
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    try:
+        with openexr.File(header, {"RGB": pixels}) as image:
+            image.write(str(scratch))
+        return scratch.read_bytes()
+    except RuntimeError as error:  # what OpenEXR makes of every error of the system
+        reason = " ".join(str(error).split())
+        fix = "free space and run the same command again"
+        raise StorageError.of(path, expected="room to write", found=f"none ({reason})", fix=fix) from error
+    finally:
+        scratch.unlink(missing_ok=True)
 
 
 def read_vertex_maps(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], list[str], dict[str, Any]]:
@@ -78,7 +88,8 @@ def read_vertex_maps(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray
             for name, entry in layout["maps"].items():
                 rows = []
                 for first in range(0, len(layout["frames"]), entry["rows"]):
-                    file = archive.extract(f"{name}.{first:06d}.exr", folder)
+                    with storage_errors(folder):
+                        file = archive.extract(f"{name}.{first:06d}.exr", folder)
                     with openexr.File(file) as image:
                         rows.append(np.array(image.channels()["RGB"].pixels, np.float32))
                 maps[name] = np.concatenate(rows) if rows else np.zeros((0, entry["vertices"], 3), np.float32)

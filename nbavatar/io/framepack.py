@@ -14,6 +14,7 @@ In a crop that sticks out of the camera's image, what lies outside has the label
 `unseen` whether there is any.
 """
 
+import contextlib
 import json
 import os
 import zipfile
@@ -49,11 +50,15 @@ class FramePackWriter:
 
     def __init__(self, path: str | os.PathLike[str], manifest: Mapping[str, Any]) -> None:
         self.manifest: dict[str, Any] = {"format": FORMAT, **manifest}
-        self._atomic = atomic_write(path)
+        self._path = path
+        self._stack = contextlib.ExitStack()
         self._written: set[str] = set()
 
     def __enter__(self) -> Self:
-        self._archive = zipfile.ZipFile(self._atomic.__enter__(), "w", zipfile.ZIP_STORED)
+        with contextlib.ExitStack() as opening:
+            temporary = opening.enter_context(atomic_write(self._path))
+            self._archive = opening.enter_context(zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED))
+            self._stack = opening.pop_all()
         return self
 
     def add(self, layer: str, frame: str, image: np.ndarray) -> None:
@@ -66,8 +71,10 @@ class FramePackWriter:
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        if error is None:
+    ) -> None:
+        with self._stack:  # closes the archive; then the file gets its name, or is removed
+            if error is not None:
+                raise error
             missing = [key for key in _REQUIRED if key not in self.manifest]
             lost = [
                 f"{layer}/{frame}"
@@ -76,14 +83,8 @@ class FramePackWriter:
                 if f"{layer}/{frame}.png" not in self._written
             ]
             if missing or lost:
-                kind, error = ValueError, ValueError(f"frame pack lacks keys {missing}, images {lost[:3]}")
-            else:
-                self._archive.writestr(zipfile.ZipInfo(_MANIFEST, _EPOCH), canonical_json(self.manifest))
-        self._archive.close()
-        self._atomic.__exit__(kind, error, trace)
-        if isinstance(error, ValueError) and trace is None:
-            raise error
-        return None
+                raise ValueError(f"frame pack lacks keys {missing}, images {lost[:3]}")
+            self._archive.writestr(zipfile.ZipInfo(_MANIFEST, _EPOCH), canonical_json(self.manifest))
 
 
 class FramePack:

@@ -16,11 +16,14 @@ from typing import Any
 import numpy as np
 
 from nbavatar.errors import DataError, require
-from nbavatar.io.atomic import atomic_write
+from nbavatar.io.atomic import atomic_write, storage_errors
 
 __all__ = ["CODECS", "VideoInfo", "VideoWriter", "probe_video", "read_video"]
 
 CODECS = ("vp09", "mp4v")
+
+_HEAD = 4096  # bytes: a file that can hold them can be made
+_PROBE = 1 << 20  # bytes: more than an encoder keeps back before it writes
 
 
 class VideoInfo:
@@ -84,13 +87,17 @@ def read_video(
 class VideoWriter:
     """Writes an mp4 under a temporary name and renames it when it is whole; a context manager.
 
+    The encoder reports no error of the disk, so what was written is read back, every frame of it, before it gets its
+    name.
+
     Args:
         path: file to write, `.mp4`.
         fps: frames a second [1/s].
-        codec: `vp09` or `mp4v`.
+        codec: `vp09` or `mp4v`; four letters of another one that this OpenCV encodes do too.
 
     Raises:
-        DataError: frames of different sizes, no frame at all, or no encoder for the codec.
+        DataError: frames of different sizes, no frame at all, no encoder for the codec, or not all frames come back.
+        StorageError: there is no room for it.
     """
 
     def __init__(self, path: str | os.PathLike[str], fps: float, codec: str = "vp09") -> None:
@@ -99,20 +106,24 @@ class VideoWriter:
         self._temporary = Path()
         self._handle: Any = None
         self._size = (0, 0)
+        self._whole = False
         self.count = 0
 
     def __enter__(self) -> "VideoWriter":
-        self._temporary = self._stack.enter_context(atomic_write(self._path))
+        with contextlib.ExitStack() as opening:
+            self._temporary = opening.enter_context(atomic_write(self._path))
+            # An encoder that cannot make its file says that it does not know the codec.
+            self._temporary.write_bytes(bytes(_HEAD))
+            self._stack = opening.pop_all()
         return self
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        if self._handle is not None:
-            self._handle.release()
-        if kind is None and self.count == 0:
-            empty = DataError.of(self._path, "frames", expected="one frame or more", found="none")
-            self._stack.__exit__(DataError, empty, None)
-            raise empty
-        self._stack.__exit__(kind, error, trace)
+        with self._stack:
+            if error is not None:
+                if self._handle is not None:
+                    self._handle.release()
+                raise error
+            self.finish()
 
     def add(self, frame: np.ndarray) -> None:
         """Appends one frame, uint8 RGB `[H, W, 3]`; odd sizes grow by a repeated row or column, as codecs want."""
@@ -132,6 +143,26 @@ class VideoWriter:
             raise DataError.of(self._path, f"frame {self.count}", expected=expected, found=f"{size[0]}x{size[1]}")
         self._handle.write(cv2.cvtColor(padded, cv2.COLOR_RGB2BGR))
         self.count += 1
+
+    def finish(self) -> None:
+        """Ends the file and reads it back; it gets its name when the `with` block ends."""
+        if self._whole:
+            return
+        if self._handle is None:
+            raise DataError.of(self._path, "frames", expected="one frame or more", found="none")
+        self._handle.release()
+        try:
+            for _ in read_video(self._temporary, indices=(), count=self.count):
+                pass
+        except DataError as error:
+            with storage_errors(self._path), open(self._temporary, "ab") as stream:  # asks the system for the reason
+                stream.write(bytes(_PROBE))
+                stream.flush()
+                os.fsync(stream.fileno())
+            found = "a file of which not all come back (the disk was full for a time, or the encoder failed)"
+            fix = "run the same command again"
+            raise DataError.of(self._path, "frames", expected=self.count, found=found, fix=fix) from error
+        self._whole = True
 
 
 class _Capture:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from nbavatar.config.tradeoff import SettingConfig, TradeoffConfig, vary
+from nbavatar.io.atomic import storage_errors
 from nbavatar.tradeoff.front import Point, choose_preset, within
 
 __all__ = ["PointLog", "first_settings", "knob_of", "run_sweep"]
@@ -55,7 +56,7 @@ class PointLog:
     def add(self, entry: dict[str, Any]) -> None:
         """Appends a line; it is on disk when this returns."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self._path, "a", encoding="utf-8") as stream:
+        with storage_errors(self._path), open(self._path, "a", encoding="utf-8") as stream:
             stream.write(json.dumps(entry, sort_keys=True) + "\n")
             stream.flush()
             os.fsync(stream.fileno())

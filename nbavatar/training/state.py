@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from nbavatar.errors import DataError, parsing
-from nbavatar.io.atomic import atomic_write
+from nbavatar.io.atomic import atomic_write, storage_errors
 from nbavatar.io.eventfile import EventFile
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import canonical_json, write_json
@@ -59,7 +59,7 @@ class RunFolder:
             self.moved_to = aside
             self._lock = self._claim()
         (self.path / "previews").mkdir(exist_ok=True)
-        for leftover in self.path.glob(".*.tmp*"):  # of a run that was killed while writing
+        for leftover in self.path.rglob(".*.tmp*"):  # of a run that was killed while writing
             leftover.unlink(missing_ok=True)
         if not key_file.exists():
             write_json(key_file, dict(key))
@@ -99,12 +99,14 @@ class RunFolder:
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace the checkpoint, atomically."""
-        with atomic_write(self.path / "state.pt") as temporary:
-            torch.save(dict(state), temporary)
+        # Into a stream, whose errors are the system's: torch's own writer does not name them.
+        with atomic_write(self.path / "state.pt") as temporary, open(temporary, "wb") as stream:
+            torch.save(dict(state), stream)
 
     def log(self, event: Mapping[str, Any]) -> None:
         """Append one line to the events, and its numbers to the curves."""
-        with open(self.path / "events.jsonl", "a", encoding="utf-8") as stream:
+        file = self.path / "events.jsonl"
+        with storage_errors(file), open(file, "a", encoding="utf-8") as stream:
             stream.write(canonical_json(dict(event)) + "\n")
         numbers = {f"train/{name}": value for name, value in event.items() if name != "step" and value is not None}
         self._event_file().scalars(event["step"], numbers)
@@ -115,7 +117,7 @@ class RunFolder:
         if not file.exists():
             return []
         events = []
-        for line in file.read_text(encoding="utf-8").splitlines():
+        for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
             try:
                 events.append(json.loads(line))
             except ValueError:
@@ -136,7 +138,9 @@ class RunFolder:
         return self._curves
 
     def _rewrite_events(self, events: list[dict[str, Any]]) -> None:
-        if events == self.events() and (self.path / "events.jsonl").exists():
+        file, text = self.path / "events.jsonl", "".join(canonical_json(event) + "\n" for event in events)
+        # Compared as text: a line that was cut off is no event, but the next one would be appended to it.
+        if file.exists() and file.read_text(encoding="utf-8", errors="replace") == text:
             return
-        with atomic_write(self.path / "events.jsonl") as temporary:
-            temporary.write_text("".join(canonical_json(event) + "\n" for event in events), encoding="utf-8")
+        with atomic_write(file) as temporary:
+            temporary.write_text(text, encoding="utf-8")

@@ -10,7 +10,7 @@ import pytest
 
 from nbavatar import devices, gpus
 from nbavatar.errors import DeviceError
-from tests.unit.users import OTHER, THIRD, as_user, public_folder  # noqa: F401
+from tests.unit.users import OTHER, THIRD, as_user
 
 WHOLE = ["GPU-00000000-0000-0000-0000-000000000001", "GPU-00000000-0000-0000-0000-000000000002"]
 
@@ -84,7 +84,7 @@ def test_processes_get_distinct_gpus_and_wait_for_a_free_one(tmp_path, two):
     assert set(outputs) == set(two)
 
 
-def test_a_lease_holds_between_users_and_leaves_no_file(public_folder, two, monkeypatch):  # noqa: F811
+def test_a_lease_holds_between_users_and_leaves_no_file(public_folder, two, monkeypatch):
     """The other user has put links under the names of lock files of old; what they point to stays as it is."""
     precious = public_folder / "precious"
     precious.write_text("everything")

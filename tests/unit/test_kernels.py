@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.users import OTHER, THIRD, as_user, public_folder  # noqa: F401
+from tests.unit.users import OTHER, THIRD, as_user
 
 ROOT = Path(__file__).parents[2]
 
@@ -99,7 +99,7 @@ def test_a_full_disk_keeps_nothing_and_stops_nothing(package):
     assert "cannot be kept" in told
 
 
-def test_what_another_user_prepared_is_passed_over(public_folder, monkeypatch, caplog):  # noqa: F811
+def test_what_another_user_prepared_is_passed_over(public_folder, monkeypatch, caplog):
     """The other has made the folders that we would use, closed and open, and a link to one of the victim's."""
     from nbavatar import kernels
 

@@ -6,7 +6,7 @@ import pytest
 
 from nbavatar.errors import DataError
 from nbavatar.private import open_private, private_folder
-from tests.unit.users import OTHER, THIRD, as_user, public_folder  # noqa: F401
+from tests.unit.users import OTHER, THIRD, as_user
 
 
 def test_a_folder_is_made_closed_and_is_found_again(tmp_path):
@@ -19,7 +19,7 @@ def test_a_folder_is_made_closed_and_is_found_again(tmp_path):
     assert private_folder(tmp_path / "a" / "b") == folder
 
 
-def test_what_another_user_prepared_is_refused(public_folder):  # noqa: F811
+def test_what_another_user_prepared_is_refused(public_folder):
     as_user(OTHER, lambda: (public_folder / "theirs").mkdir(mode=0o777))
     as_user(OTHER, lambda: (public_folder / "open").mkdir())
     as_user(OTHER, lambda: (public_folder / "open").chmod(0o777))
@@ -62,7 +62,7 @@ def test_links_of_our_own_and_of_the_system_are_followed_above_the_folder(tmp_pa
         private_folder(tmp_path / "loop" / "below")
 
 
-def test_files_are_opened_without_following_links_or_cutting(public_folder):  # noqa: F811
+def test_files_are_opened_without_following_links_or_cutting(public_folder):
     precious = public_folder / "precious"
     precious.write_text("everything")
     os.chown(precious, THIRD, THIRD)

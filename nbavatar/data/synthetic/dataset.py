@@ -7,6 +7,7 @@ deformations in the canonical frame with the minus sign and rubbish at the neck,
 padding, pickles as Python 2 and 3.7 wrote them.
 """
 
+import contextlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,9 +21,10 @@ from nbavatar.data.synthetic.legacy_pickle import dump_array, dump_legacy
 from nbavatar.data.synthetic.models import Human, flame_content, landmark_content, mano_content, mirrored_mano_content
 from nbavatar.data.synthetic.scene import Scene, build_bodies, make_scene
 from nbavatar.data.synthetic.studio import lens_of, light_up, make_cameras, photograph
-from nbavatar.errors import DataError, require
+from nbavatar.errors import DataError
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.records import write_json
+from nbavatar.io.video import VideoWriter
 
 __all__ = ["TEST_SUBJECTS", "detect", "write_assets", "write_dataset", "write_subject"]
 
@@ -275,8 +277,7 @@ def _write_videos(
     lenses = [lens_of(camera, supersample) for camera in cameras.values()]
     resolution = int(np.clip(lenses[0].camera.height, 256, 1024))
     paths = [(base / "videos" / name / f"{c}.mp4", base / "segmentations" / name / f"{c}.mp4") for c in cameras]
-    size = (lenses[0].camera.width, lenses[0].camera.height)
-    with _Videos([p for pair in paths for p in pair], size, codec) as videos, ThreadPoolExecutor(workers) as pool:
+    with _Videos([p for pair in paths for p in pair], codec) as videos, ThreadPoolExecutor(workers) as pool:
         for n in progress(range(len(scene.head)), f"{name} images", len(scene.head)):
             posed = pose_figure(figure, scene, n)
             lights = light_up(posed[0], figure.faces, resolution)
@@ -286,45 +287,36 @@ def _write_videos(
                 return photograph(lenses[index], figure, posed, lights, noise=0.8, rng=rng)
 
             for index, (image, person) in enumerate(pool.map(take, range(len(lenses)))):
-                videos.write(2 * index, image[..., ::-1])
+                videos.write(2 * index, image)
                 videos.write(2 * index + 1, np.repeat(person[..., None], 3, 2))
 
 
 class _Videos:
     """Several video files that appear under their names only when all are whole."""
 
-    def __init__(self, paths: list[Path], size: tuple[int, int], codec: str) -> None:
-        self._paths, self._size, self._codec = paths, size, codec
+    def __init__(self, paths: list[Path], codec: str) -> None:
+        if len(codec) != 4:
+            raise DataError.of("synthesize", "codec", expected="four letters such as mp4v", found=codec)
+        self._writers = [VideoWriter(path, FRAMES_PER_SECOND, codec) for path in paths]
+        self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> "_Videos":
-        import contextlib
-
-        cv2 = require("cv2", "opencv-contrib-python-headless", "writing videos")
-        if len(self._codec) != 4:
-            raise DataError.of("synthesize", "codec", expected="four letters such as mp4v", found=self._codec)
-        self._stack, self._writers = contextlib.ExitStack(), []
-        try:
-            for path in self._paths:
-                temporary = self._stack.enter_context(atomic_write(path))
-                writer = cv2.VideoWriter(
-                    str(temporary), cv2.VideoWriter_fourcc(*self._codec), FRAMES_PER_SECOND, self._size
-                )
-                if not writer.isOpened():
-                    raise DataError.of(
-                        path, "codec", expected="one that this OpenCV writes, such as mp4v", found=self._codec
-                    )
-                self._stack.callback(writer.release)
-                self._writers.append(writer)
-        except BaseException as error:
-            self._stack.__exit__(type(error), error, error.__traceback__)
-            raise
+        with contextlib.ExitStack() as opening:
+            for writer in self._writers:
+                opening.enter_context(writer)
+            self._stack = opening.pop_all()
         return self
 
     def write(self, index: int, frame: np.ndarray) -> None:
-        self._writers[index].write(np.ascontiguousarray(frame))
+        """Appends a frame, uint8 RGB `[H, W, 3]`, to one of them."""
+        self._writers[index].add(frame)
 
-    def __exit__(self, *error: Any) -> None:
-        self._stack.__exit__(*error)
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        with self._stack:
+            if error is not None:
+                raise error
+            for writer in self._writers:
+                writer.finish()
 
 
 def _bytes(path: Path, content: bytes) -> None:

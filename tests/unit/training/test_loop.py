@@ -26,6 +26,7 @@ from nbavatar.training.method import create_method
 from nbavatar.training.setup import initial_avatar
 from nbavatar.training.state import RunFolder
 from tests.scenes.toy import sequence, write_scene
+from tests.unit.disks import fill
 
 CONFIG = TrainConfig(
     steps=12, texels=4, unet=UNetConfig(width=4, depth=3, max_width=8, convs=1), weight_lpips=0.0, previews=0,
@@ -291,6 +292,25 @@ def test_killed_at_any_moment_the_same_command_gives_the_same_weights(scene, tmp
     subprocess.run(program + _command(scene, whole, config), env=environment, check=True, capture_output=True)
     a, b = (torch.load(path, weights_only=True)["state"] for path in (broken, whole))
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_on_a_full_disk_it_stops_and_goes_on_from_its_checkpoint(scene, tmp_path, small_disk, capsys) -> None:
+    whole, broken = tmp_path / "whole.pt", small_disk / "broken.pt"
+    assert main(_command(scene, whole, CONFIG)) == 0
+    size = Path(f"{whole}.state", "state.pt").stat().st_size
+    filler = fill(small_disk, 3 * size // 2)  # the first checkpoint finds room, the second, written beside it, does not
+    capsys.readouterr()
+    assert main(_command(scene, broken, CONFIG)) == 2
+    error = capsys.readouterr().err
+    assert f"nbavatar train: error: {broken}.state/state.pt: expected room to write, found a full disk" in error
+    assert "Traceback" not in error and not broken.exists()
+    first = torch.load(f"{broken}.state/state.pt", weights_only=True)["step"]
+    assert 0 < first < CONFIG.steps
+    filler.unlink()
+    assert main(_command(scene, broken, CONFIG)) == 0
+    a, b = (torch.load(path, weights_only=True)["state"] for path in (broken, whole))
+    assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+    assert not [path for path in small_disk.rglob("*") if ".tmp" in path.name]
 
 
 @pytest.mark.slow
