@@ -20,13 +20,14 @@ import argparse
 from contextlib import ExitStack
 from pathlib import Path
 
-from nbavatar.cli.report import read_histories, read_renders
+from nbavatar.cli.report import read_renders
+from nbavatar.cli.results import read_evaluation, read_histories, read_timing
 from nbavatar.config.core import to_mapping
 from nbavatar.config.figures import FigureLayout, choose_figure, read_figures
 from nbavatar.data.sequences import MeshSequence, read_sequence
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
-from nbavatar.io.records import read_json, write_json
+from nbavatar.io.records import write_json
 from nbavatar.provenance import run_record
 from nbavatar.reporting.gallery import (
     Drawn,
@@ -81,13 +82,13 @@ def _draw(args: argparse.Namespace, layout: FigureLayout) -> Drawn:
     if layout.kind == "curves":
         return curves_drawn(read_histories(args.histories))
     if layout.kind == "pareto":
-        speeds = [(Path(path).stem, read_json(path)) for path in args.speeds]
-        return pareto_drawn([read_json(path) for path in args.evals], speeds, layout.protocol)
+        speeds = [(Path(path).stem, read_timing(path)) for path in args.speeds]
+        return pareto_drawn([read_evaluation(path) for path in args.evals], speeds, layout.protocol)
     with ExitStack() as stack:
         crops = [stack.enter_context(FramePack(path)) for path in args.frames]
         if layout.kind == "comparison":
             packs = [stack.enter_context(FramePack(path)) for path in args.renders]
-            evals = [(path, read_json(path)) for path in args.evals]
+            evals = [(path, read_evaluation(path)) for path in args.evals]
             return comparison_drawn(read_renders(packs, evals), crops, layout)
         if layout.kind == "contact":
             return contact_drawn(_sequences(args.sequences, layout), crops, layout.frames)

@@ -21,19 +21,19 @@ Every part may be left out; what is not given is not shown.
 import argparse
 import base64
 import csv
-import json
 import os
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from nbavatar.cli.common import add_cfg_argument, stage_config
+from nbavatar.cli.results import read_evaluation, read_histories, read_sweep, read_timing
 from nbavatar.config.evaluation import ReportConfig
-from nbavatar.errors import DataError
+from nbavatar.errors import DataError, parsing
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.images import decode_image
-from nbavatar.io.records import read_json
+from nbavatar.io.records import read_record
 from nbavatar.reporting.comparison import Rendered, compare_frames, to_strip
 from nbavatar.reporting.markdown import markdown_to_html
 from nbavatar.reporting.page import (
@@ -49,7 +49,7 @@ from nbavatar.reporting.page import (
 from nbavatar.reporting.pictures import data_uri, reduce_picture
 from nbavatar.tradeoff.section import offline_section, savings_section, tradeoff_section
 
-__all__ = ["add_arguments", "main", "read_histories", "read_renders"]
+__all__ = ["add_arguments", "main", "read_renders"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,8 +77,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Writes the page."""
     cfg = stage_config(args, ReportConfig)
-    evals = [(path, read_json(path)) for path in args.evals]
-    speeds = [(path, read_json(path)) for path in args.speeds]
+    evals = [(path, read_evaluation(path)) for path in args.evals]
+    speeds = [(path, read_timing(path)) for path in args.speeds]
     with ExitStack() as stack:
         renders = read_renders([stack.enter_context(FramePack(path)) for path in args.renders], evals)
         crops = [stack.enter_context(FramePack(path)) for path in args.frames]
@@ -112,15 +112,14 @@ def _tables(paths: list[str]) -> dict[str, tuple[str, str]]:
     texts: dict[str, dict[str, str]] = {}
     for name in paths:
         path = Path(name)
-        try:
+        with parsing(name, "a table (.md or .csv)"):
             texts.setdefault(str(path.with_suffix("")), {})[path.suffix] = path.read_text(encoding="utf-8")
-        except FileNotFoundError as error:
-            raise DataError.of(name, expected="a table (.md or .csv)", found="no such file") from error
     shown = {}
     for name, found in texts.items():
         path, table = Path(name), found.get(".csv", "")
         title = path.stem if ".md" in found else f"{path.parent.name} {path.stem}"
-        shown[title] = found.get(".md") or _as_markdown(title, table), table
+        with parsing(f"{name}.csv", "a table (.csv)"):
+            shown[title] = found.get(".md") or _as_markdown(title, table), table
     return shown
 
 
@@ -163,25 +162,6 @@ def read_renders(packs: list[FramePack], evals: list[tuple[str, Any]]) -> list[R
     return found
 
 
-def read_histories(paths: list[str]) -> dict[str, list[dict[str, Any]]]:
-    """Logged lines by avatar, named by the last two folders of the file."""
-    histories: dict[str, list[dict[str, Any]]] = {}
-    for name in paths:
-        avatar = "/".join(Path(name).parts[-3:-1])
-        if avatar in histories:
-            raise DataError.of(name, expected="one history an avatar", found=f"{avatar} twice")
-        try:
-            lines = Path(name).read_text(encoding="utf-8").splitlines()
-            histories[avatar] = [json.loads(line) for line in lines if line.strip()]
-        except FileNotFoundError as error:
-            raise DataError.of(name, expected="a training history (.jsonl)", found="no such file") from error
-        except json.JSONDecodeError as error:
-            raise DataError.of(
-                name, expected="one JSON object a line", found=f"text that does not parse ({error})"
-            ) from error
-    return histories
-
-
 def _training(paths: list[str], histories: dict[str, list[dict[str, Any]]], cfg: ReportConfig) -> str:
     if not paths:
         return ""
@@ -205,10 +185,7 @@ _SWEEPS = {
 
 
 def _sweep(path: Path, cfg: ReportConfig) -> str:
-    result = read_json(path)
-    kind = result.get("kind") if isinstance(result, dict) else None
-    if kind not in _SWEEPS:
-        raise DataError.of(path, "kind", expected=f"one of {', '.join(_SWEEPS)}", found=repr(kind))
+    kind, result = read_sweep(path)
     tell, table = _SWEEPS[kind]
     section = tell(result, _text(path.with_name(table)))
     named = [(caption, _embedded(path.with_name(name), cfg), caption) for name, caption in section.figures]
@@ -230,14 +207,15 @@ def _limits(path: Path, cfg: ReportConfig) -> str:
 
 
 def _text(path: Path) -> str:
-    try:
+    with parsing(path, "a table (.md)"):
         return path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="a table (.md)", found="no such file") from error
 
 
 def _embedded(path: Path, cfg: ReportConfig) -> str:
     return data_uri(reduce_picture(decode_image(path), 3 * cfg.max_side))
+
+
+_FIGURE = {"title?": (str, None), "caption?": (str, None), "shown?": [str]}
 
 
 def _is_figure(name: str) -> bool:
@@ -250,7 +228,7 @@ def _picture(name: str, cfg: ReportConfig) -> tuple[str, str, str]:
     title = " ".join(part for part in path.parts[-3:-1] if part not in ("", "/")) + f" {path.stem}"
     text = f"Picture of the stage {title}"
     if _is_figure(name):
-        said = read_json(path.with_suffix(".json"))
+        said = read_record(path.with_suffix(".json"), _FIGURE)
         title = ". ".join(part.rstrip(".") for part in (said.get("title"), said.get("caption")) if part) or path.stem
         text = f"{title}: {', '.join(said.get('shown', [])) or 'nothing yet'}"
     return title, _embedded(path, cfg), text

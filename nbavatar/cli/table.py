@@ -15,12 +15,12 @@ import argparse
 from pathlib import Path
 
 from nbavatar.cli.common import add_cfg_argument, stage_config
+from nbavatar.cli.results import read_result
 from nbavatar.config.core import to_mapping
 from nbavatar.config.evaluation import TableConfig
 from nbavatar.config.tables import choose_table, read_tables
-from nbavatar.errors import DataError
+from nbavatar.errors import parsing
 from nbavatar.io.atomic import atomic_write
-from nbavatar.io.records import read_json
 from nbavatar.provenance import file_digest, run_record
 from nbavatar.reporting.cells import Source, Table
 from nbavatar.reporting.formats import to_csv, to_latex, to_markdown
@@ -78,9 +78,7 @@ def read_results(paths: list[str]) -> list[Result]:
     """
     results = []
     for path in paths:
-        content = read_json(path)
-        if not isinstance(content, dict):
-            raise DataError.of(path, expected="a result of nbavatar evaluate or speed", found="another JSON file")
+        content = read_result(path)
         content = {"subject": Path(path).parent.name, "variant": Path(path).stem} | content
         size = content.get("size") or content.get("speed", {}).get("size")
         pixels = (int(size[0]), int(size[1])) if size else None
@@ -90,8 +88,5 @@ def read_results(paths: list[str]) -> list[Result]:
 
 
 def _read_printed(path: str) -> dict:
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="the numbers printed in the paper (.csv)", found="no such file") from error
-    return read_printed(lines, path)
+    with parsing(path, "the numbers printed in the paper (.csv)"):
+        return read_printed(Path(path).read_text(encoding="utf-8-sig").splitlines(), path)

@@ -14,12 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from nbavatar.errors import DataError, StorageError, require
+from nbavatar.errors import StorageError, parsing, require
+from nbavatar.io.archives import open_archive
 from nbavatar.io.atomic import atomic_write, storage_errors, temporary_beside
+from nbavatar.io.forms import check_form
 from nbavatar.io.records import canonical_json
 
 __all__ = ["half_error", "read_vertex_maps", "write_vertex_maps"]
 
+_FORM = {"frames": [str], "maps": {str: {"vertices": int, "rows": int}}, "record": dict}
 # Rows of one image: 512 frames of a head are 31 MB before compression.
 _ROWS = 512
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -82,22 +85,32 @@ def read_vertex_maps(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray
     """
     openexr: Any = require("OpenEXR", "OpenEXR", "float images of the deformation")
     maps = {}
-    try:
-        with zipfile.ZipFile(path) as archive, tempfile.TemporaryDirectory() as folder:
-            layout = json.loads(archive.read("manifest.json"))
-            for name, entry in layout["maps"].items():
-                rows = []
-                for first in range(0, len(layout["frames"]), entry["rows"]):
-                    with storage_errors(folder):
-                        file = archive.extract(f"{name}.{first:06d}.exr", folder)
-                    with openexr.File(file) as image:
-                        rows.append(np.array(image.channels()["RGB"].pixels, np.float32))
-                maps[name] = np.concatenate(rows) if rows else np.zeros((0, entry["vertices"], 3), np.float32)
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="vertex maps (.exr.zip)", found="no such file") from error
-    except (zipfile.BadZipFile, KeyError, ValueError, RuntimeError) as error:
-        raise DataError.of(path, expected="vertex maps (.exr.zip)", found=f"a damaged one ({error})") from error
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        parsing(path, "vertex maps (.exr.zip)"),
+        open_archive(path) as archive,
+    ):
+        layout = json.loads(archive.read("manifest.json"))
+        check_form(layout, _FORM, path, "manifest.json")
+        count = len(layout["frames"])
+        for name, entry in layout["maps"].items():
+            values = np.zeros((count, entry["vertices"], 3), np.float32)
+            for first in range(0, count, max(entry["rows"], 1)):
+                file, encoded = os.path.join(folder, "image.exr"), archive.read(f"{name}.{first:06d}.exr")
+                with storage_errors(folder), open(file, "wb") as stream:
+                    stream.write(encoded)
+                with openexr.File(file) as image:
+                    part = values[first : first + entry["rows"]]
+                    part[:] = _pixels(image, part.shape)
+            maps[name] = values
     return maps, list(layout["frames"]), dict(layout["record"])
+
+
+def _pixels(image: Any, shape: tuple[int, ...]) -> np.ndarray:
+    pixels = np.asarray(image.channels()["RGB"].pixels)
+    if pixels.shape != shape or pixels.dtype.kind != "f":
+        raise ValueError(f"an image of {pixels.dtype} {list(pixels.shape)} instead of {list(shape)}")
+    return pixels
 
 
 def half_error(values: np.ndarray) -> float:

@@ -25,8 +25,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from nbavatar.errors import DataError
+from nbavatar.errors import DataError, describe, parsing
+from nbavatar.io.archives import open_archive
 from nbavatar.io.atomic import atomic_write
+from nbavatar.io.forms import check_form, matrix_form
 from nbavatar.io.images import decode_image, encode_png
 from nbavatar.io.records import canonical_json
 from nbavatar.names import check_name
@@ -101,19 +103,11 @@ class FramePack:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        try:
-            self._archive = zipfile.ZipFile(self.path)
+        with parsing(path, "a frame pack (.zip)", damaged="a damaged file"), contextlib.ExitStack() as opening:
+            self._archive = opening.enter_context(open_archive(self.path))
             self.manifest: dict[str, Any] = json.loads(self._archive.read(_MANIFEST))
-        except FileNotFoundError as error:
-            raise DataError.of(path, expected="a frame pack (.zip)", found="no such file") from error
-        except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
-            raise DataError.of(path, expected="a frame pack (.zip)", found=f"a damaged file ({error})") from error
-        if self.manifest.get("format") != FORMAT:
-            found = self.manifest.get("format")
-            raise DataError.of(path, "format", expected=FORMAT, found=found, fix="make it again with this version")
-        for key in _REQUIRED:
-            if key not in self.manifest:
-                raise DataError.of(path, key, expected="this key in manifest.json", found="none")
+            _check_manifest(self.manifest, self.path)
+            opening.pop_all()  # stays open
         self.frames: list[str] = list(self.manifest["frames"])
         self.layers: list[str] = list(self.manifest["layers"])
         check_name(str(self.manifest["subject"]), path, "subject", error=DataError)
@@ -136,12 +130,10 @@ class FramePack:
     def read(self, layer: str, frame: str) -> np.ndarray:
         """Decodes one image to uint8 `[H, W]` or `[H, W, 3]`."""
         name = f"{layer}/{frame}.png"
-        try:
+        if name not in self._archive.NameToInfo:
+            raise DataError.of(self.path, name, expected="this image", found="none of that name")
+        with parsing(self.path, "a whole image", field=name, damaged="damage"):
             encoded = self._archive.read(name)
-        except KeyError as error:
-            raise DataError.of(self.path, name, expected="this image", found="none of that name") from error
-        except (zipfile.BadZipFile, OSError, EOFError) as error:
-            raise DataError.of(self.path, name, expected="a whole image", found=f"damage ({error})") from error
         return decode_image(encoded, f"{self.path}: {name}")
 
     def unseen(self, frame: str) -> np.ndarray | None:
@@ -151,16 +143,55 @@ class FramePack:
     def intrinsics(self, frame: str) -> np.ndarray:
         """Camera matrix of one frame, float64 `[3, 3]` [px], of the images in this pack."""
         per_frame = self.manifest.get("K_per_frame")
-        if per_frame is not None:
-            return np.array(per_frame[frame], dtype=np.float64)
-        return np.array(self.manifest["K"], dtype=np.float64)
+        stored = self.manifest.get("K") if per_frame is None else per_frame.get(frame)
+        if stored is None:
+            raise DataError.of(self.path, f"K of frame {frame}", expected="a camera matrix", found="none")
+        return np.array(stored, dtype=np.float64)
 
     @property
     def cam_from_world(self) -> np.ndarray:
         """World-to-camera transform, float64 `[4, 4]`, translation in [m]."""
-        return np.array(self.manifest["cam_from_world"], dtype=np.float64)
+        stored = self.manifest["cam_from_world"]
+        if stored is None:
+            raise DataError.of(self.path, "cam_from_world", expected="one camera's place", found="a pack of several")
+        return np.array(stored, dtype=np.float64)
 
     def split(self, name: str) -> list[str]:
         """Frame ids of the split `train` or `test`, in time order."""
         split = self.manifest.get("split", {})
         return [frame for frame in self.frames if split.get(frame, "train") == name]
+
+
+_FORM = {
+    "stage": str,
+    "subject": str,
+    "camera": str,
+    "width": int,
+    "height": int,
+    "cam_from_world": (None, matrix_form(4, 4)),  # null in renders of several cameras
+    "cam_from_world_per_frame?": (None, {str: matrix_form(4, 4)}),
+    "K?": (None, matrix_form(3, 3)),
+    "K_per_frame?": (None, {str: matrix_form(3, 3)}),
+    "distortion?": (None, [float]),
+    "frames": [str],
+    "layers": (dict, [str]),
+    "split?": {str: str},
+    "segments?": [(Ellipsis, 2, int)],
+    "record?": (None, {"config?": (None, dict), "tuned?": (None, dict), "training?": (None, dict), "variant?": object}),
+    "variant?": (None, str),
+    "background?": (None, (Ellipsis, 3, float)),
+}
+
+
+def _check_manifest(manifest: Any, path: Path) -> None:
+    if isinstance(manifest, dict) and manifest.get("format") != FORMAT:
+        found = describe(manifest.get("format"))
+        raise DataError.of(path, "format", expected=FORMAT, found=found, fix="make it again with this version")
+    check_form(manifest, _FORM, path)
+    for key in ("width", "height"):
+        if manifest[key] < 1:
+            raise DataError.of(path, key, expected="a size [px]", found=manifest[key])
+    count = len(manifest["frames"])
+    if any(not 0 <= first <= last < count for first, last in manifest.get("segments", ())):
+        expected = f"first and last of {count} frames"
+        raise DataError.of(path, "segments", expected=expected, found=describe(manifest["segments"]))

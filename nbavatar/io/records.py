@@ -5,10 +5,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from nbavatar.errors import DataError
+from nbavatar.errors import parsing
 from nbavatar.io.atomic import atomic_write
+from nbavatar.io.forms import check_form
 
-__all__ = ["canonical_json", "read_json", "write_json"]
+__all__ = ["canonical_json", "read_json", "read_record", "write_json"]
 
 
 def canonical_json(value: Any) -> str:
@@ -29,9 +30,16 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     Raises:
         DataError: the file is missing or is not JSON.
     """
-    try:
+    with parsing(path, "JSON", damaged="text that does not parse"):
         return json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="a JSON file", found="no such file") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError.of(path, expected="JSON", found=f"text that does not parse ({error})") from error
+
+
+def read_record(path: str | os.PathLike[str], form: Any) -> Any:
+    """Reads JSON that has a form (`nbavatar.io.forms`).
+
+    Raises:
+        DataError: the file is missing, is not JSON, or looks different; the key is named.
+    """
+    value = read_json(path)
+    check_form(value, form, path)
+    return value

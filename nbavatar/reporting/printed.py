@@ -4,16 +4,18 @@ Values stay text: "0.9711" and "0.976" have different precisions, and both are s
 """
 
 import csv
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 
-from nbavatar.errors import DataError
+from nbavatar.errors import DataError, describe
 from nbavatar.reporting.ranks import rank_marks
 
 __all__ = ["Printed", "deviating_marks", "deviating_means", "read_printed", "recomputed_mean"]
 
 _COLUMNS = ["table", "row", "column", "value", "mark", "note"]
+_NUMBER = re.compile(r"-?[0-9]{1,12}(\.[0-9]{1,12})?")
 _HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False, "fps": True, "ms": False}
 
 
@@ -45,11 +47,15 @@ def read_printed(lines: Iterable[str], where: str) -> dict[tuple[str, str, str],
         raise DataError.of(where, "header", expected=", ".join(_COLUMNS), found=found)
     cells: dict[tuple[str, str, str], Printed] = {}
     for row in reader:
+        if None in row or any(value is None for value in row.values()):
+            raise DataError.of(where, f"line {reader.line_num}", expected=f"{len(_COLUMNS)} columns", found="others")
         key = (row["table"], row["row"], row["column"])
         if key in cells:
             raise DataError.of(where, "/".join(key), expected="each cell once", found="it twice")
         if row["mark"] not in ("", "best", "second"):
             raise DataError.of(where, "/".join(key), expected="mark best, second or nothing", found=repr(row["mark"]))
+        if row["column"].rpartition(".")[2] in _HIGHER_IS_BETTER and not _NUMBER.fullmatch(row["value"]):
+            raise DataError.of(where, "/".join(key), expected="a number as printed", found=describe(row["value"]))
         cells[key] = Printed(row["value"], row["mark"], row["note"] or "")
     return cells
 

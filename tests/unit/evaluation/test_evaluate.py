@@ -54,7 +54,7 @@ def write_crop(path, camera, seed, unseen=None):
 
 def write_render(path, images: dict[str, np.ndarray], record=None):
     manifest = {
-        "stage": "render", "subject": "S2", "variant": "full", "camera": "*", "width": SIZE, "height": SIZE,
+        "stage": "render", "subject": "S2", "variant": "full", "camera": "102", "width": SIZE, "height": SIZE,
         "cam_from_world": np.eye(4).tolist(), "frames": list(images), "layers": {"rgb": ""}, "record": record or {},
     }  # fmt: skip
     with FramePackWriter(path, manifest) as pack:

@@ -213,7 +213,7 @@ def test_missing_file_is_one_line_and_exit_2(tmp_path, capsys):
 def test_truth_is_found_by_subject_camera_size_and_intrinsics(tmp_path):
     from nbavatar.io.framepack import FramePack
 
-    render = FramePack(write_pack(tmp_path / "r.zip", "S2", "*", ["102/f"], ("rgb",), per_frame=True))
+    render = FramePack(write_pack(tmp_path / "r.zip", "S2", "102", ["102/f"], ("rgb",), per_frame=True))
     crops = [
         FramePack(write_pack(tmp_path / f"{i}.zip", subject, camera, ["f"], ("rgb", "alpha"), K_at=at))
         for i, (subject, camera, at) in enumerate(
