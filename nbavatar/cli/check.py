@@ -19,8 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from nbavatar.cli.common import progress
-from nbavatar.data.capture import read_coverage, read_mask, read_mesh, read_rgb
+from nbavatar.config.preprocess import MATTE_THRESHOLD
+from nbavatar.data.capture import read_mesh, read_rgb
 from nbavatar.data.capture_check import CaptureReport, check_capture
+from nbavatar.data.capture_masks import CameraMasks
 from nbavatar.data.decaf import CAMERAS, DecafSubject, find_subject
 from nbavatar.data.decaf_check import SubjectReport, check_subject
 from nbavatar.data.decaf_inventory import missing_files, missing_message
@@ -101,10 +103,20 @@ def _write_decaf_sheet(subject: DecafSubject, report: SubjectReport, path: Path)
     for name, camera in progress(report.cameras.items(), f"overlays {subject.name}"):
         image = next(read_video(subject.file("videos", f"{name}.mp4")))
         matte = next(read_video(subject.file("segmentations", f"{name}.mp4"), gray=True))
-        over = mesh_over_image(image, camera, meshes, (matte > 127).astype(np.uint8))
+        over = mesh_over_image(image, camera, meshes, (matte > MATTE_THRESHOLD).astype(np.uint8))
         rows.append([(f"{subject.name} {name} frame 0", image), ("meshes, outline of the matte", over)])
     with atomic_write(path) as temporary:
         temporary.write_bytes(encode_png(contact_sheet(rows, cell=640), level=6))
+
+
+def _outlined(masks: CameraMasks | None, frame: str) -> np.ndarray | None:
+    """What is outlined in a picture: labels, or 1 where a matte is above the threshold."""
+    if masks is None:
+        return None
+    if masks.mask is not None and masks.mask.kind == "label":
+        return masks.read_mask(frame)
+    matte = masks.read_coverage(frame) if masks.mask is None else masks.read_mask(frame)
+    return None if matte is None else (matte > MATTE_THRESHOLD).astype(np.uint8)
 
 
 def _write_overlays(report: CaptureReport, out: Path) -> None:
@@ -123,12 +135,9 @@ def _write_overlays(report: CaptureReport, out: Path) -> None:
             try:
                 image = read_rgb(capture, camera, frame)
                 mesh = read_mesh(capture.root, frame, report.topology)
-                mask, alpha = read_mask(capture, camera, frame), read_coverage(capture, camera, frame)
             except DataError:
                 continue
-            label = mask[1] if mask else alpha
-            if label is not None and label.max(initial=0) > 3:
-                label = (label > 127).astype(np.uint8)
+            label = _outlined(report.masks.get(camera.name), frame)
             meshes = {part: (mesh[part], faces) for part, (faces, _) in report.topology.items() if part in mesh}
             over = mesh_over_image(image, camera, meshes, label)
             rows.append([(f"{camera.name} {frame}", image), ("meshes, outline of masks", over)])

@@ -32,6 +32,7 @@ from nbavatar.bodymodels.mano import Mano, mirror_model
 from nbavatar.cli.common import add_cfg_argument, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.geometry import FitConfig
+from nbavatar.config.preprocess import MATTE_THRESHOLD
 from nbavatar.data.sequences import MeshSequence, read_sequence, write_sequence
 from nbavatar.errors import DataError
 from nbavatar.fitting.pictures import contact_sheet
@@ -44,7 +45,6 @@ from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
 
-_MATTE_THRESHOLD = 127
 # A share of keypoints off the fitted mesh above which the fit itself is in doubt.
 _UNEXPLAINED = 0.5
 
@@ -132,7 +132,7 @@ def _read_masks(packs: dict[str, FramePack], frames: list[str], cfg: FitConfig) 
     chosen = [common[i] for i in spread]
     labels, layer = layers[0] == "label", layers[0]
     images = {
-        camera: np.stack([pack.read(layer, frames[i]) > (0 if labels else _MATTE_THRESHOLD) for i in chosen])
+        camera: np.stack([pack.read(layer, frames[i]) > (0 if labels else MATTE_THRESHOLD) for i in chosen])
         for camera, pack in packs.items()
     }
     return Masks(chosen, images, labels)

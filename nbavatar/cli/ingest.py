@@ -8,7 +8,7 @@ Reads, by --layout,
 and writes a frame pack (zip of PNGs and manifest.json, see `nbavatar.io.framepack`) at native size, still distorted:
 
   rgb       uint8 [H, W, 3]   sRGB
-  person    uint8 [H, W]      matte of the whole person                     } decaf, and captures with 0/255 masks
+  person    uint8 [H, W]      matte of the whole person                     } decaf, and captures with mattes
   label     uint8 [H, W]      0 background, 1 head, 2 right, 3 left hand    } captures with
   alpha     uint8 [H, W]      coverage, 255 = full                          } label masks
 
@@ -18,11 +18,13 @@ the subject ends the command with one line and no output.
 """
 
 import argparse
+import dataclasses
 
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import IngestConfig
 from nbavatar.data.capture import open_capture
+from nbavatar.data.capture_masks import open_masks
 from nbavatar.data.decaf import find_subject, read_camera
 from nbavatar.data.frame_plan import manifest_of, plan_capture, plan_decaf
 from nbavatar.data.sources import LAYERS, capture_images, capture_layers, decaf_images
@@ -66,8 +68,14 @@ def main(args: argparse.Namespace) -> None:
         capture = open_capture(args.root, pixel_center=cfg.pixel_center)
         camera, report = capture.camera(args.camera), {}
         plan = plan_capture(capture, **choice)
-        layers = capture_layers(capture, camera, plan)
-        images = capture_images(capture, camera, plan, layers)
+        masks = open_masks(capture, camera, plan.frames)
+        layers = capture_layers(masks)
+        images = capture_images(capture, masks, plan.frames)
+        report["masks"] = {
+            name: dataclasses.asdict(meaning)
+            for name, meaning in (("masks", masks.mask), ("alpha", masks.coverage))
+            if meaning is not None
+        }
         inputs = {name: capture.root / name for name in ("cameras.json", "splits.json")}
     extra = {
         "layout": args.layout,

@@ -2,7 +2,7 @@
 
 Reads a frame pack with `person` (a matte of the whole person, 0..255) or `label` masks, and a mesh sequence (.npz)
 with the same frames; or masks of your own (--supplied, or `supplied` in --cfg): FOLDER/[SUBJECT/]CAMERA/FRAME.png or
-FOLDER/[SUBJECT/]CAMERA.mp4, with labels 0..3 or with 0 and 255.
+FOLDER/[SUBJECT/]CAMERA.mp4, with labels 0..3 (images only, or video without loss) or mattes of the person.
 
 Writes a frame pack of the same frames, size and camera (still distorted):
 
@@ -64,16 +64,15 @@ def main(args: argparse.Namespace) -> None:
         numbers = MaskNumbers(cfg.threshold, cfg.hole_fraction, cfg.island_fraction, cfg.temporal, cfg.soft_alpha)
         statistics = MaskStatistics()
         supplied = args.supplied or cfg.supplied
-        masks = _masks(pack, supplied, manifest["subject"], camera)
+        masks, matte = _masks(pack, supplied, manifest["subject"], camera, tuple(sequence.parts))
         extra = {"subject": manifest["subject"], "camera": camera.name, "supplied": bool(supplied)}
         inputs = {"frames": args.frames, "meshes": args.meshes}
         record = run_record("masks", config=to_mapping(cfg), inputs=inputs, extra=extra)
         layers = {name: LAYERS[name] for name in ("label", "alpha")}
         with FramePackWriter(args.out, {**manifest, "stage": "masks", "layers": layers, "record": record}) as out:
             model = ClothesModel(cfg.clothes_evidence) if _sorts_clothes(cfg, pack) else None
-            cut = cut_masks(
-                masks, cutter, runs, numbers, statistics, images=lambda frame: pack.read("rgb", frame), clothes=model
-            )
+            images = {"images": lambda frame: pack.read("rgb", frame), "clothes": model}
+            cut = cut_masks(masks, cutter, runs, numbers, statistics, matte=matte, **images)
             for frame, label, alpha in progress(cut, f"masks {manifest['subject']}/{camera.name}", len(frames)):
                 out.add("label", frame, label)
                 out.add("alpha", frame, alpha)
@@ -85,16 +84,16 @@ def _sorts_clothes(cfg: MasksConfig, pack: FramePack) -> bool:
 
 
 def _masks(
-    pack: FramePack, supplied: str, subject: str, camera: Camera
-) -> Iterator[tuple[str, np.ndarray, np.ndarray | None]]:
-    """(frame, mask, coverage or None), from the user's files or from the pack."""
+    pack: FramePack, supplied: str, subject: str, camera: Camera, parts: tuple[str, ...]
+) -> tuple[Iterator[tuple[str, np.ndarray, np.ndarray | None]], bool]:
+    """(frame, mask, coverage or None), from the user's files or from the pack; and whether they are mattes."""
     if supplied:
-        own = supplied_masks(supplied, subject, camera.name, pack.frames, camera.width, camera.height)
-        return ((frame, mask, None) for frame, mask in zip(pack.frames, own))
+        own, meaning = supplied_masks(supplied, subject, camera, pack.frames, parts)
+        return ((frame, mask, None) for frame, mask in zip(pack.frames, own)), meaning.kind == "person"
     if "label" in pack.layers:
         alpha = "alpha" in pack.layers
-        return ((f, pack.read("label", f), pack.read("alpha", f) if alpha else None) for f in pack.frames)
+        return ((f, pack.read("label", f), pack.read("alpha", f) if alpha else None) for f in pack.frames), False
     if "person" in pack.layers:
-        return ((frame, pack.read("person", frame), None) for frame in pack.frames)
+        return ((frame, pack.read("person", frame), None) for frame in pack.frames), True
     fix = "supply masks of your own with --supplied"
     raise DataError.of(pack.path, "layers", expected="person or label", found=", ".join(pack.layers), fix=fix)

@@ -4,7 +4,10 @@ import dataclasses
 
 from nbavatar.config.core import option
 
-__all__ = ["CropConfig", "FramesConfig", "IngestConfig", "MasksConfig", "TracksConfig"]
+__all__ = ["MATTE_THRESHOLD", "CropConfig", "FramesConfig", "IngestConfig", "MasksConfig", "TracksConfig"]
+
+MATTE_THRESHOLD = 127
+"""A matte above this is foreground, unless the options of `masks` say otherwise [0..255]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,9 +58,11 @@ class MasksConfig:
     supplied: str = option(
         "",
         "Folder with masks of your own, used instead of the dataset's: [<subject>/]<camera>/<frame>.png or "
-        "[<subject>/]<camera>.mp4; labels 0..3, or 0 and 255 for the person, which is then cut by the meshes.",
+        "[<subject>/]<camera>.mp4; labels 0..3 (not in lossy files), or mattes of the person, to be cut by the meshes.",
     )
-    threshold: int = option(127, "A matte above this is foreground; mask videos are lossy [0..255].", min=0, max=254)
+    threshold: int = option(
+        MATTE_THRESHOLD, "A matte above this is foreground; mask videos are lossy [0..255].", min=0, max=254
+    )
     keep: str = option(
         "parts",
         "What of a matte is labelled: parts, what the meshes say is head or hand; person, all of it (hair of any "

@@ -2,8 +2,8 @@
 
     cameras.json                       camera -> width, height, K, R, t (world-to-camera, OpenCV) [, distortion]
     images/<camera>/<frame>.<type>     jpg, png or webp
-    masks/<camera>/<frame>.png         0 background, 1 head, 2 right hand, 3 left hand; or 0 and 255 for the person
-    alpha/<camera>/<frame>.png         optional coverage, 8 bit
+    masks/<camera>/<frame>.png         0 background, 1 head, 2 right hand, 3 left hand; or a matte of the whole person
+    alpha/<camera>/<frame>.png         optional coverage
     meshes/topology.npz                head_faces, right_hand_faces, left_hand_faces: any subset [, <part>_rest]
     meshes/<frame>.npz                 head, right_hand, left_hand [m]; optional head_rigid, the head without contact
     splits.json                        frames [, train, test, cuts, test_camera] [, contact: frame -> true or false, for
@@ -22,11 +22,12 @@ import numpy as np
 from nbavatar.camera.distortion import checked_coefficients
 from nbavatar.camera.pinhole import Camera
 from nbavatar.config.cameras import parse_camera, read_rig
+from nbavatar.data.pictures import find_picture
 from nbavatar.data.sequences import PARTS
 from nbavatar.data.splits import segments_of
 from nbavatar.errors import DataError, describe, did_you_mean
 from nbavatar.io.arrays import read_arrays
-from nbavatar.io.images import decode_image
+from nbavatar.io.pictures import read_colours
 from nbavatar.io.records import read_json
 from nbavatar.names import check_name
 
@@ -34,10 +35,7 @@ __all__ = [
     "Capture",
     "Splits",
     "camera_of",
-    "find_image",
     "open_capture",
-    "read_coverage",
-    "read_mask",
     "read_mesh",
     "read_rgb",
     "read_splits",
@@ -45,7 +43,6 @@ __all__ = [
 ]
 
 _SPLITS = ("frames", "train", "test", "cuts", "test_camera", "contact")
-_TYPES = (".jpg", ".jpeg", ".png", ".webp")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,43 +142,13 @@ def _cuts(stored: Mapping[str, Any], frames: Sequence[str], path: Path) -> list[
     return pairs
 
 
-def find_image(root: Path, kind: str, camera: str, frame: str) -> Path | None:
-    """Path of `<kind>/<camera>/<frame>.<type>`, or None if there is none of the known types."""
-    for suffix in _TYPES:
-        path = root / kind / camera / f"{frame}{suffix}"
-        if path.is_file():
-            return path
-    return None
-
-
 def read_rgb(capture: Capture, camera: Camera, frame: str) -> np.ndarray:
     """Reads one image, uint8 `[H, W, 3]`, of exactly the camera's size."""
-    path = find_image(capture.root, "images", camera.name, frame)
+    folder = capture.root / "images" / camera.name
+    path = find_picture(folder, frame)
     if path is None:
-        wanted = capture.root / "images" / camera.name / f"{frame}.jpg"
-        raise DataError.of(wanted, expected="an image (jpg, png or webp)", found="none")
-    image = _sized(decode_image(path), path, camera)
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-
-
-def read_mask(capture: Capture, camera: Camera, frame: str) -> tuple[str, np.ndarray] | None:
-    """Reads one mask and tells its kind.
-
-    Returns:
-        ("label", uint8 `[H, W]` of 0..3) or ("person", uint8 `[H, W]` of 0..255), or None where there is no file.
-        A mask with a value above 3 is of the second kind.
-    """
-    path = find_image(capture.root, "masks", camera.name, frame)
-    if path is None:
-        return None
-    mask = _gray(_sized(decode_image(path), path, camera))
-    return ("label" if mask.max(initial=0) <= 3 else "person"), mask
-
-
-def read_coverage(capture: Capture, camera: Camera, frame: str) -> np.ndarray | None:
-    """Reads one alpha image, uint8 `[H, W]`, or None where there is no file."""
-    path = find_image(capture.root, "alpha", camera.name, frame)
-    return None if path is None else _gray(_sized(decode_image(path), path, camera))
+        raise DataError.of(folder / f"{frame}.jpg", expected="an image (jpg, png or webp)", found="none")
+    return read_colours(path, (camera.width, camera.height))
 
 
 def read_topology(root: Path) -> dict[str, tuple[np.ndarray, np.ndarray | None]]:
@@ -254,17 +221,6 @@ def _ids(stored: Mapping[str, Any], key: str, path: Path) -> list[str]:
     if twice:
         raise DataError.of(path, key, expected="each frame once", found=f"'{twice[0]}' twice")
     return [check_name(frame, path, key, error=DataError) for frame in ids]
-
-
-def _sized(image: np.ndarray, path: Path, camera: Camera) -> np.ndarray:
-    if image.shape[:2] != (camera.height, camera.width):
-        expected = f"{camera.width} x {camera.height} as in cameras.json"
-        raise DataError.of(path, "size", expected=expected, found=f"{image.shape[1]} x {image.shape[0]}")
-    return image
-
-
-def _gray(image: np.ndarray) -> np.ndarray:
-    return image if image.ndim == 2 else image[..., 0]
 
 
 def _check_vertices(verts: np.ndarray, faces: np.ndarray, path: Path, name: str, count: int | None) -> None:

@@ -10,16 +10,16 @@ import numpy as np
 
 from nbavatar.camera.pinhole import Camera
 from nbavatar.config.cameras import read_rig, stored_test_camera
+from nbavatar.config.preprocess import MATTE_THRESHOLD
 from nbavatar.data.capture import (
     Capture,
     camera_of,
-    read_coverage,
-    read_mask,
     read_mesh,
     read_rgb,
     read_splits,
     read_topology,
 )
+from nbavatar.data.capture_masks import CameraMasks, open_masks
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
 from nbavatar.mesh.topology import mesh_defects
@@ -42,6 +42,7 @@ class CaptureReport:
         capture: the capture, if its cameras can be read.
         frames: frame ids.
         topology: faces and rest vertices of the parts.
+        masks: camera -> its masks, if they can be read.
     """
 
     defects: list[str] = dataclasses.field(default_factory=list)
@@ -50,6 +51,7 @@ class CaptureReport:
     capture: Capture | None = None
     frames: list[str] = dataclasses.field(default_factory=list)
     topology: dict[str, tuple[np.ndarray, np.ndarray | None]] = dataclasses.field(default_factory=dict)
+    masks: dict[str, CameraMasks] = dataclasses.field(default_factory=dict)
 
 
 class _Collector:
@@ -173,46 +175,40 @@ def _check_camera(
     found: _Collector,
     progress: Callable[[Iterable[str], str], Iterable[str]],
 ) -> None:
-    name, kinds, covered, overlaps = camera.name, {}, {}, []
+    name, overlaps = camera.name, []
     masks_folder = capture.root / "masks" / name
     labels: set[int] = set()
+    masks = found.attempt(f"masks {name}", lambda: open_masks(capture, camera, report.frames))
+    if masks is not None:
+        report.masks[name] = masks
+        if report.frames and masks.mask is None and masks.coverage is None:
+            line = DataError.of(masks_folder, expected="a mask (or an alpha image) for each frame", found="none")
+            found.note(f"no mask {name}", str(line))
+        for kind, meaning in (("masks", masks.mask), ("alpha", masks.coverage)):
+            if meaning is not None and meaning.white not in (0, 255, 65535):
+                where = capture.root / kind / name
+                report.notes.append(f"{where}: a matte in which {meaning.white} is full coverage")
     for frame in progress(report.frames, f"check {name}"):
         found.attempt(f"images {name}", lambda: read_rgb(capture, camera, frame))  # noqa: B023
-        mask = found.attempt(f"masks {name}", lambda: read_mask(capture, camera, frame))  # noqa: B023
-        alpha = found.attempt(f"alpha {name}", lambda: read_coverage(capture, camera, frame))  # noqa: B023
-        covered[frame] = alpha is not None
-        kinds[frame] = mask[0] if mask else "none"
+        if masks is None:
+            continue
+        mask, alpha = masks.read_mask(frame), masks.read_coverage(frame)
         if mask is None:
             continue
-        if mask[0] == "label":
-            labels |= set(np.unique(mask[1]).tolist())
-            if alpha is not None and not ((alpha > 0) & (mask[1] > 0)).any() and (mask[1] > 0).any():
+        if masks.mask is not None and masks.mask.kind == "label":
+            labels |= set(np.unique(mask).tolist())
+            if alpha is not None and not ((alpha > 0) & (mask > 0)).any() and (mask > 0).any():
                 line = DataError.of(
                     capture.root / "alpha" / name / frame, expected="coverage where the mask has parts", found="none"
                 )  # fmt: skip
                 found.note(f"alpha agreement {name}", str(line))
-        if not (mask[1] > 0).any():
+            there = mask > 0
+        else:
+            there = mask > MATTE_THRESHOLD
+        if not there.any():
             report.notes.append(f"{masks_folder / frame}: the mask is empty")
         elif frame in meshes:
-            overlaps.append(_overlap(camera, report.topology, meshes[frame], mask[1]))
-    missing = [frame for frame, kind in kinds.items() if kind == "none"]
-    if missing and len(missing) < len(kinds):
-        found.note(
-            f"no mask {name}", f"{masks_folder / missing[0]}.png: expected a mask, found none ({len(missing)} missing)"
-        )
-    elif missing and not any(covered.values()):
-        line = DataError.of(masks_folder, expected="a mask (or an alpha image) for each frame", found="none")
-        found.note(f"no mask {name}", str(line))
-    if any(covered.values()) and not all(covered.values()):
-        lost = next(frame for frame, there in covered.items() if not there)
-        line = DataError.of(
-            capture.root / "alpha" / name / f"{lost}.png", expected="alpha for all frames or none", found="none"
-        )
-        found.note(f"no alpha {name}", str(line))
-    if {"label", "person"} <= set(kinds.values()):
-        expected, grey = "labels 0..3 in all masks, or 0..255 in all", sum(k == "person" for k in kinds.values())
-        line = DataError.of(masks_folder, expected=expected, found=f"{grey} of {len(kinds)} masks with values above 3")
-        found.note(f"mixed masks {name}", str(line))
+            overlaps.append(_overlap(camera, report.topology, meshes[frame], there))
     for value in sorted(labels - {0}):
         part = PARTS[value - 1]
         if report.topology and part not in report.topology:
@@ -237,11 +233,11 @@ def _overlap(
     mesh: Mapping[str, np.ndarray],
     mask: np.ndarray,
 ) -> float:
-    """Intersection over union of mask and mesh silhouette, at a quarter of the resolution."""
+    """Intersection over union of mask (bool `[H, W]`) and mesh silhouette, at a quarter of the resolution."""
     step = max(1, max(camera.width, camera.height) // 256)
     K = camera.K.copy()
     K[:2] /= step
-    small = mask[step // 2 :: step, step // 2 :: step] > 0
+    small = mask[step // 2 :: step, step // 2 :: step]
     height, width = small.shape
     covered = np.zeros_like(small)
     for part, (faces, _) in topology.items():

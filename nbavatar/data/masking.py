@@ -53,18 +53,20 @@ def cut_masks(
     numbers: MaskNumbers,
     statistics: MaskStatistics,
     *,
+    matte: bool,
     images: Callable[[str], np.ndarray] | None = None,
     clothes: ClothesModel | None = None,
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yields (frame, label uint8 `[H, W]`, alpha uint8 `[H, W]`) in the order of `masks`.
 
     Args:
-        masks: (frame, mask, coverage or None) in time order. A mask with values above 3 is a person's matte and is
-            cut by the meshes; one of 0..3 holds labels already and is only cleaned.
+        masks: (frame, mask, coverage or None) in time order.
         cutter: the camera's.
         runs: frames of each uncut run; flicker is not repaired across cuts.
         numbers: thresholds.
         statistics: filled in on the way.
+        matte: whether the masks are mattes of the whole person, 0..255, to be cut by the meshes; else they hold labels
+            already and are only cleaned.
         images: reads the colour image of a frame, for `clothes`.
         clothes: removes cloth from the neck of mattes; None leaves it there.
     """
@@ -72,22 +74,23 @@ def cut_masks(
     window: list[_Frame] = []
     for name, mask, coverage in masks:
         colours = images if clothes is not None else None
-        window.append(_prepare(name, mask, coverage, cutter, numbers, statistics, colours, clothes))
+        window.append(_prepare(name, mask, coverage, matte, cutter, numbers, statistics, colours, clothes))
         if len(window) == 3:
-            yield _finish(window[0], window[1], window[2], run_of, numbers, statistics)
+            yield _finish(window[0], window[1], window[2], run_of, matte, numbers, statistics)
             window.pop(0)
         elif len(window) == 1:
             first = window[0]
         else:
-            yield _finish(None, first, window[1], run_of, numbers, statistics)
+            yield _finish(None, first, window[1], run_of, matte, numbers, statistics)
     if window:
-        yield _finish(None, window[-1], None, run_of, numbers, statistics)
+        yield _finish(None, window[-1], None, run_of, matte, numbers, statistics)
 
 
 def _prepare(
     name: str,
     mask: np.ndarray,
     coverage: np.ndarray | None,
+    matte: bool,
     cutter: PartCutter,
     numbers: MaskNumbers,
     statistics: MaskStatistics,
@@ -95,7 +98,7 @@ def _prepare(
     clothes: ClothesModel | None,
 ) -> _Frame:
     outlines = cutter.silhouettes(name)
-    if mask.max(initial=0) > 3:
+    if matte:
         label = cutter.cut(mask, outlines, numbers.threshold)
         if images is not None and clothes is not None:
             image, person = images(name), mask > numbers.threshold
@@ -120,11 +123,12 @@ def _finish(
     now: _Frame,
     after: _Frame | None,
     run_of: Mapping[str, int],
+    matte: bool,
     numbers: MaskNumbers,
     statistics: MaskStatistics,
 ) -> tuple[str, np.ndarray, np.ndarray]:
     label = now.label
-    matte = now.mask.max(initial=0) > 3  # labels that were given are not second-guessed
+    # Labels that were given are not second-guessed.
     if numbers.temporal and matte and before is not None and after is not None:
         if run_of.get(before.name) == run_of.get(now.name) == run_of.get(after.name):
             label = repair_flicker(before.label, now.label, after.label, now.support)

@@ -1,13 +1,14 @@
 """Images of one camera, frame after frame, from either input layout: one frame is in memory at a time."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from nbavatar.camera.pinhole import Camera
-from nbavatar.data.capture import Capture, read_coverage, read_mask, read_rgb
+from nbavatar.data.capture import Capture, read_rgb
+from nbavatar.data.capture_masks import CameraMasks
 from nbavatar.data.decaf import DecafSubject
 from nbavatar.data.frame_plan import FramePlan
 from nbavatar.errors import DataError
@@ -52,49 +53,36 @@ def _in_step(colour: Path, matte: Path, plan: FramePlan) -> Iterator[tuple[str, 
         pass
 
 
-def capture_layers(capture: Capture, camera: Camera, plan: FramePlan) -> tuple[str, ...]:
+def capture_layers(masks: CameraMasks) -> tuple[str, ...]:
     """Layers that `capture_images` will yield, from the kinds of masks that the capture holds.
 
-    Label masks give rgb, label, alpha; 0..255 masks, or alpha alone, give rgb and person (to be cut by the meshes); a
-    capture with neither gives rgb only, which is enough where masks are supplied separately.
-
-    Raises:
-        DataError: a frame has no mask while others have.
+    Label masks give rgb, label, alpha; mattes, or alpha alone, give rgb and person (to be cut by the meshes); a capture
+    with neither gives rgb only, which is enough where masks are supplied separately.
     """
-    kinds: dict[str, str] = {}
-    for frame in plan.frames:
-        found = read_mask(capture, camera, frame)
-        kinds[frame] = found[0] if found else "none"
-    covered = all(read_coverage(capture, camera, frame) is not None for frame in plan.frames[:1])
-    # An empty mask (nobody in view) fits both kinds, so a person's mask anywhere decides.
-    if "none" in kinds.values():
-        lost = [frame for frame, kind in kinds.items() if kind == "none"]
-        if len(lost) < len(kinds):
-            path = capture.root / "masks" / camera.name / f"{lost[0]}.png"
-            raise DataError.of(path, expected="a mask as for the other frames", found=f"none ({len(lost)} are missing)")
-        return ("rgb", "person") if covered else ("rgb",)
-    return ("rgb", "person") if "person" in kinds.values() else ("rgb", "label", "alpha")
+    if masks.mask is None:
+        return ("rgb",) if masks.coverage is None else ("rgb", "person")
+    return ("rgb", "person") if masks.mask.kind == "person" else ("rgb", "label", "alpha")
 
 
 def capture_images(
-    capture: Capture, camera: Camera, plan: FramePlan, layers: tuple[str, ...]
+    capture: Capture, masks: CameraMasks, frames: Sequence[str]
 ) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """Yields (frame id, images of `layers`).
+    """Yields (frame id, images of `capture_layers`) of the masks' camera.
 
     Coverage is the capture's alpha within its labels' reach, or 255 wherever a label is. Where alpha is above zero
     and the label is 0 (hair, soft edges) the label is taken from the nearest labelled pixel, so that every covered
     pixel belongs to a part.
     """
-    for frame in plan.frames:
-        images = {"rgb": read_rgb(capture, camera, frame)}
-        mask, alpha = read_mask(capture, camera, frame), read_coverage(capture, camera, frame)
+    layers = capture_layers(masks)
+    for frame in frames:
+        images = {"rgb": read_rgb(capture, masks.camera, frame)}
         if "person" in layers:
-            person = mask[1] if mask else alpha
+            person = masks.read_coverage(frame) if masks.mask is None else masks.read_mask(frame)
             assert person is not None
             images["person"] = person
         if "label" in layers:
-            assert mask is not None
-            label = mask[1]
+            label, alpha = masks.read_mask(frame), masks.read_coverage(frame)
+            assert label is not None
             if alpha is None:
                 alpha = np.where(label > 0, np.uint8(255), np.uint8(0))
             images["label"], images["alpha"] = _agree(label, alpha)

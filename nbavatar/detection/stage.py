@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from nbavatar.config.detection import DetectConfig
+from nbavatar.config.preprocess import MATTE_THRESHOLD
 from nbavatar.detection.correspondence import FACE_TRUST, face_landmarks, hand_joints
 from nbavatar.detection.faces import Face, FaceFinder, square_of_mesh
 from nbavatar.detection.hands import Hand, HandFinder
@@ -20,7 +21,6 @@ COUNTS = {"head": 68, "right_hand": 21, "left_hand": 21}
 """Keypoints of each part."""
 
 _LABELS = {"right_hand": 2, "left_hand": 3}
-_MATTE_THRESHOLD = 127
 # Hands near a face are searched in a square of this many faces.
 _REACH = 3.0
 # Share of a hand's joints that have to lie on a hand (labels), or on the person (mattes).
@@ -72,7 +72,7 @@ class Detector:
     def _find_face(self, image: np.ndarray, mask: np.ndarray | None, labels: bool, last: Face | None) -> Face | None:
         whole = frame_windows(image.shape[1], image.shape[0])
         if mask is not None:
-            own = mask_window(mask == 1 if labels else mask > _MATTE_THRESHOLD)
+            own = mask_window(mask == 1 if labels else mask > MATTE_THRESHOLD)
             whole = [own, *whole] if own else whole
         return self._face.find(image, whole, last)
 
@@ -92,7 +92,7 @@ class Detector:
             if not shown:
                 return []
         elif mask is not None:
-            windows[0] = mask_window(mask > _MATTE_THRESHOLD, windows[0][1:]) or windows[0]
+            windows[0] = mask_window(mask > MATTE_THRESHOLD, windows[0][1:]) or windows[0]
         found = self._hand.find(image, windows, last, most=most)
         return found if mask is None else [hand for hand in found if _lies_on(hand, mask, labels)]
 
@@ -172,7 +172,7 @@ def _lies_on(hand: Hand, mask: np.ndarray, labels: bool) -> bool:
     under = _under(hand, mask)
     if not len(under):
         return False
-    return bool((under >= 2).mean() >= _ON_HAND if labels else (under > _MATTE_THRESHOLD).mean() >= _ON_PERSON)
+    return bool((under >= 2).mean() >= _ON_HAND if labels else (under > MATTE_THRESHOLD).mean() >= _ON_PERSON)
 
 
 def _under(hand: Hand, mask: np.ndarray) -> np.ndarray:

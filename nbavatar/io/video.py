@@ -21,16 +21,22 @@ from nbavatar.io.atomic import atomic_write, storage_errors
 __all__ = ["CODECS", "VideoInfo", "VideoWriter", "probe_video", "read_video"]
 
 CODECS = ("vp09", "mp4v")
+_LOSSLESS = ("FFV1", "FFVH", "HFYU", "MPNG", "PNG", "PNG1", "UTVI", "ULRG", "ULRA", "ULY0", "ULY2", "ULY4")
 
 _HEAD = 4096  # bytes: a file that can hold them can be made
 _PROBE = 1 << 20  # bytes: more than an encoder keeps back before it writes
 
 
 class VideoInfo:
-    """What a video's header says: `width`, `height` [px], `count` [frames] (0 where unknown), `fps` [1/s]."""
+    """What a video's header says: `width`, `height` [px], `count` [frames] (0 where unknown), `fps` [1/s], `codec`."""
 
-    def __init__(self, width: int, height: int, count: int, fps: float) -> None:
-        self.width, self.height, self.count, self.fps = width, height, count, fps
+    def __init__(self, width: int, height: int, count: int, fps: float, codec: str) -> None:
+        self.width, self.height, self.count, self.fps, self.codec = width, height, count, fps, codec
+
+    @property
+    def lossy(self) -> bool:
+        """Whether the codec changes values; one that may or may not (H.264) is said to."""
+        return self.codec.upper().strip() not in _LOSSLESS
 
 
 def probe_video(path: str | os.PathLike[str]) -> VideoInfo:
@@ -184,6 +190,7 @@ class _Capture:
             int(get(cv2.CAP_PROP_FRAME_HEIGHT)),
             max(0, round(get(cv2.CAP_PROP_FRAME_COUNT))),
             float(get(cv2.CAP_PROP_FPS)),
+            int(get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True).decode("latin-1"),
         )
 
     def __enter__(self) -> "_Capture":

@@ -39,7 +39,10 @@ DAMAGES = {
     "camera": (lambda c: write_json(c / "cameras.json", lambda d: d["left"].pop("K")), "camera left: K: expected this"),
     "image gone": (lambda c: (c / "images/left/t1.png").unlink(), "t1.jpg: expected an image"),
     "image cut short": (lambda c: (c / "images/left/t1.png").write_bytes(b"\x89PNG"), "t1.png: expected a whole image"),
-    "mask gone": (lambda c: (c / "masks/right/t3.png").unlink(), "t3.png: expected a mask, found none"),
+    "mask gone": (
+        lambda c: (c / "masks/right/t3.png").unlink(),
+        "t3.png: expected a mask as for the other frames, found none",
+    ),
     "mask size": (
         lambda c: Image.fromarray(np.ones((4, 4), np.uint8)).save(c / "masks/right/t3.png"),
         "t3.png: size: expected 96 x 80",
@@ -57,7 +60,7 @@ DAMAGES = {
             (c / "alpha/left").mkdir(parents=True),
             shutil.copy(c / "masks/left/t0.png", c / "alpha/left/t0.png"),
         ),
-        "expected alpha for all frames or none",
+        "t1.png: expected an alpha image as for the other frames",
     ),
     "NaN": (lambda c: damage_mesh(c, head=np.full((337, 3), np.nan, np.float32)), "head: expected finite coordinates"),
     "mesh gone": (lambda c: (c / "meshes/t4.npz").unlink(), "t4.npz: expected an array file"),

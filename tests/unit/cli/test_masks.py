@@ -69,12 +69,57 @@ def test_masks_of_one_s_own_by_video(decaf, tiny, tmp_path):
     assert masks(tmp_path, supplied=str(tmp_path / "short")) == 2
 
 
+def test_labels_in_lossy_files_are_refused(decaf, tiny, tmp_path, capfd):
+    common = ["--layout", "decaf", "--root", str(decaf), "--subject", "S2", "--cfg", '{"every": 3}']
+    assert main(["ingest", *common, "--camera", "084", "--out", str(tmp_path / "left.zip")]) == 0
+    assert main(["tracks", *common, "--out", str(tmp_path / "t.npz")]) == 0
+    label = np.zeros((48, 64), np.uint8)
+    label[10:30, 10:30], label[20:40, 35:50] = 1, 2
+    for step in (1, 85):
+        tiny.write_video(tmp_path / f"own{step}" / "084.mp4", [label * step] * 12)
+        assert masks(tmp_path, supplied=str(tmp_path / f"own{step}")) == 2
+        assert "084.mp4: values: expected labels 0..3" in capfd.readouterr().err
+    writer = cv2.VideoWriter(str(tmp_path / "084.mkv"), cv2.VideoWriter_fourcc(*"FFV1"), 25, (64, 48))
+    for _ in range(12):
+        writer.write(cv2.cvtColor(label, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    assert masks(tmp_path, supplied=str(tmp_path), temporal=False) == 0
+    with FramePack(tmp_path / "m.zip") as pack:
+        np.testing.assert_array_equal(pack.read("label", pack.frames[0]), label)
+    (tmp_path / "jpg/084").mkdir(parents=True)
+    for i in range(12):
+        Image.fromarray(label).save(tmp_path / f"jpg/084/{i}.jpg")
+    assert masks(tmp_path, supplied=str(tmp_path / "jpg")) == 2
+    assert "084: values: expected labels 0..3" in capfd.readouterr().err
+
+
+def test_a_person_of_0_and_1_is_cut_by_the_meshes_as_one_of_0_and_255_is(prepared, capture_master):
+    assert masks(prepared) == 0
+    with FramePack(prepared / "m.zip") as pack:
+        expected = {frame: pack.read("label", frame) for frame in pack.frames}
+    for camera in ("left", "right"):
+        for i in range(5):
+            path = prepared / "own" / camera / f"t{i}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            label = np.array(Image.open(capture_master / "masks" / camera / f"t{i}.png"))
+            Image.fromarray(np.minimum(label, 1)).save(path)
+    assert masks(prepared, "--supplied", str(prepared / "own")) == 0
+    with FramePack(prepared / "m.zip") as pack:
+        for frame in pack.frames:
+            np.testing.assert_array_equal(pack.read("label", frame), expected[frame])
+    # A hand that another camera's labels show makes labels of this camera's ones, too.
+    Image.open(capture_master / "masks/right/t0.png").save(prepared / "own/right/t0.png")
+    assert masks(prepared, "--supplied", str(prepared / "own")) == 0
+    with FramePack(prepared / "m.zip") as pack:
+        assert set(np.unique(pack.read("label", "t3"))) == {0, 1}
+
+
 def test_bad_masks_of_one_s_own(prepared, capfd):
     own = prepared / "own" / "left"
     own.mkdir(parents=True)
     Image.fromarray(np.zeros((10, 10), np.uint8)).save(own / "t0.png")
     assert masks(prepared, "--supplied", str(prepared / "own")) == 2
-    assert "t0.png: size: expected 96 x 80, found 10 x 10" in capfd.readouterr().err
+    assert "t0.png: size: expected 96 x 80 as its camera says, found 10 x 10" in capfd.readouterr().err
     cv2.imwrite(str(own / "t0.png"), np.zeros((80, 96), np.uint8))
     assert masks(prepared, "--supplied", str(prepared / "own")) == 2
     assert "frame t1: expected a mask such as t1.png, found none" in capfd.readouterr().err

@@ -6,13 +6,12 @@ from PIL import Image
 
 from nbavatar.data.capture import (
     open_capture,
-    read_coverage,
-    read_mask,
     read_mesh,
     read_rgb,
     read_splits,
     read_topology,
 )
+from nbavatar.data.capture_masks import open_masks
 from nbavatar.data.capture_tracks import build_capture_tracks
 from nbavatar.data.frame_plan import plan_capture
 from nbavatar.data.sources import capture_images, capture_layers
@@ -107,19 +106,18 @@ def test_splits_that_cannot_be(capture, change, line):
 
 def test_label_masks_give_labels_and_full_coverage(capture):
     opened = open_capture(capture)
-    camera, plan = opened.camera("left"), plan_capture(opened, **CHOICE)
-    layers = capture_layers(opened, camera, plan)
-    assert layers == ("rgb", "label", "alpha")
-    for frame, images in capture_images(opened, camera, plan, layers):
-        kind, mask = read_mask(opened, camera, frame)
-        assert kind == "label"
+    plan = plan_capture(opened, **CHOICE)
+    masks = open_masks(opened, opened.camera("left"), plan.frames)
+    assert capture_layers(masks) == ("rgb", "label", "alpha")
+    for frame, images in capture_images(opened, masks, plan.frames):
+        mask = np.array(Image.open(capture / "masks/left" / f"{frame}.png"))
         np.testing.assert_array_equal(images["label"], mask)
         np.testing.assert_array_equal(images["alpha"], np.where(mask > 0, 255, 0))
 
 
 def test_alpha_beyond_the_labels_spreads_them(capture):
     opened = open_capture(capture)
-    camera, plan = opened.camera("left"), plan_capture(opened, **CHOICE)
+    plan = plan_capture(opened, **CHOICE)
     for frame in plan.frames:
         label = np.array(Image.open(capture / "masks/left" / f"{frame}.png"))
         alpha = np.where(label > 0, 255, 0).astype(np.uint8)
@@ -128,28 +126,81 @@ def test_alpha_beyond_the_labels_spreads_them(capture):
         path = capture / "alpha/left" / f"{frame}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(alpha).save(path)
-    for frame, images in capture_images(opened, camera, plan, ("rgb", "label", "alpha")):
+    for _, images in capture_images(opened, open_masks(opened, opened.camera("left"), plan.frames), plan.frames):
         assert ((images["label"] > 0) == (images["alpha"] > 0)).all()
         assert (images["label"][:5, 40:50] == 1).all() and (images["alpha"][:5, 40:50] == 77).all()
 
 
 def test_person_masks_and_alpha_alone_are_left_for_the_meshes_to_cut(capture):
     opened = open_capture(capture)
-    camera, plan = opened.camera("left"), plan_capture(opened, **CHOICE)
-    for frame in plan.frames:
+    camera, frames = opened.camera("left"), plan_capture(opened, **CHOICE).frames
+    for frame in frames:
         path = capture / "masks/left" / f"{frame}.png"
         label = np.array(Image.open(path))
         Image.fromarray(np.where(label > 0, 255, 0).astype(np.uint8)).save(path)
-    assert capture_layers(opened, camera, plan) == ("rgb", "person")
+    assert capture_layers(open_masks(opened, camera, frames)) == ("rgb", "person")
     (capture / "masks/left/t2.png").unlink()
     with pytest.raises(DataError, match=r"masks/left/t2\.png: expected a mask as for the other frames"):
-        capture_layers(opened, camera, plan)
+        open_masks(opened, camera, frames)
     (capture / "alpha").mkdir()
     (capture / "masks" / "left").rename(capture / "alpha" / "left")
     Image.fromarray(np.zeros((80, 96), np.uint8)).save(capture / "alpha/left/t2.png")
-    assert capture_layers(opened, camera, plan) == ("rgb", "person")
-    frames = dict(capture_images(opened, camera, plan, ("rgb", "person")))
-    np.testing.assert_array_equal(frames["t0"]["person"], read_coverage(opened, camera, "t0"))
+    masks = open_masks(opened, camera, frames)
+    assert capture_layers(masks) == ("rgb", "person")
+    pictures = dict(capture_images(opened, masks, frames))
+    np.testing.assert_array_equal(pictures["t0"]["person"], masks.read_coverage("t0"))
+
+
+def test_masks_of_0_and_1_are_the_person_where_no_camera_labels_a_hand(capture):
+    opened = open_capture(capture)
+    camera, frames = opened.camera("left"), [f"t{i}" for i in range(5)]
+    for path in capture.glob("masks/left/*"):
+        Image.fromarray(np.minimum(np.array(Image.open(path)), 1)).save(path)
+    assert open_masks(opened, camera, frames).mask.kind == "label", "the other camera has labels of a hand"
+    for path in capture.glob("masks/right/*"):
+        Image.fromarray(np.minimum(np.array(Image.open(path)), 1)).save(path)
+    masks = open_masks(opened, camera, frames)
+    assert (masks.mask.kind, masks.mask.white) == ("person", 1)
+    assert set(np.unique(masks.read_mask("t0"))) == {0, 255}
+    topology = dict(np.load(capture / "meshes/topology.npz"))
+    np.savez(capture / "meshes/topology.npz", head_faces=topology["head_faces"])
+    assert open_masks(opened, camera, frames).mask.kind == "label", "a head and nothing else"
+
+
+@pytest.mark.parametrize(
+    ("files", "line"),
+    [
+        (["t1.PNG"], None),
+        (["t1.Jpeg"], None),
+        (["t1.tif"], r"t1\.tif: expected an image \(jpg, png or webp\), found \.tif; convert it to png"),
+        (["t1.png", "t1.jpg"], r"left: expected one picture t1, found t1\.jpg and t1\.png; keep one of them"),
+    ],
+)
+def test_suffixes_in_any_case_and_others_are_named(capture, files, line):
+    opened = open_capture(capture)
+    source = capture / "images/left/t1.png"
+    expected = np.array(Image.open(source))
+    picture = Image.open(source).copy()
+    source.unlink()
+    for file in files:
+        picture.save(source.with_name(file), **({"quality": 100} if "j" in file.lower() else {}))
+    if line is None:
+        found = read_rgb(opened, opened.camera("left"), "t1")
+        assert np.abs(found.astype(int) - expected).mean() < 6, "the loss of JPEG"
+    else:
+        with pytest.raises(DataError, match=line):
+            read_rgb(opened, opened.camera("left"), "t1")
+
+
+def test_an_alpha_image_that_is_missing_is_named(capture):
+    (capture / "alpha/left").mkdir(parents=True)
+    for path in sorted((capture / "masks/left").iterdir())[:-1]:
+        Image.fromarray(255 * (np.array(Image.open(path)) > 0).astype(np.uint8)).save(
+            capture / "alpha/left" / path.name
+        )
+    opened = open_capture(capture)
+    with pytest.raises(DataError, match=r"alpha/left/t4\.png: expected an alpha image as for the other frames"):
+        open_masks(opened, opened.camera("left"), [f"t{i}" for i in range(5)])
 
 
 def test_an_image_of_another_size_or_none(capture):

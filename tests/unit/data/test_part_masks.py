@@ -73,12 +73,12 @@ def scene(tiny):
     return build(tiny)
 
 
-def cut(scene, mattes, numbers=NUMBERS, runs=None, coverage=None):
+def cut(scene, mattes, numbers=NUMBERS, runs=None, coverage=None, matte=True):
     sequence, camera, _, _ = scene
     statistics = MaskStatistics()
     source = ((f, m, coverage) for f, m in zip(sequence.frames, mattes))
     cutter = PartCutter(sequence, camera, MARGINS)
-    return list(cut_masks(source, cutter, runs or [sequence.frames], numbers, statistics)), statistics
+    return list(cut_masks(source, cutter, runs or [sequence.frames], numbers, statistics, matte=matte)), statistics
 
 
 def test_torso_and_forearm_go_and_hair_stays(scene):
@@ -111,7 +111,7 @@ def test_one_frame_s_fault_is_repaired_but_not_across_a_cut(scene):
 
 
 def test_labels_that_are_given_are_kept(scene):
-    result, statistics = cut(scene, scene[3])
+    result, statistics = cut(scene, scene[3], matte=False)
     for (_, label, _), truth in zip(result, scene[3]):
         np.testing.assert_array_equal(label, truth)
     assert statistics.dropped == statistics.flicker == 0
@@ -119,7 +119,7 @@ def test_labels_that_are_given_are_kept(scene):
 
 def test_coverage_is_carried_and_soft_edges_are_an_option(scene):
     soft = np.full((HEIGHT, WIDTH), 90, np.uint8)
-    for _, label, alpha in cut(scene, scene[3], coverage=soft)[0]:
+    for _, label, alpha in cut(scene, scene[3], coverage=soft, matte=False)[0]:
         np.testing.assert_array_equal(alpha, np.where(label > 0, 90, 0))
     blurred = [cv2.GaussianBlur(matte, (0, 0), 1.5) for matte in scene[2]]
     numbers = MaskNumbers(127, 0.01, 0.02, True, True)

@@ -1,0 +1,196 @@
+"""What the values of masks mean: the one decision, for `check`, `ingest` and `masks` alike.
+
+A camera's masks hold labels 0..3, or they are mattes: near 0 for the background, near one other value for the person,
+soft only along edges. That value may be 1, 100, 255 or 65535; mattes are scaled so that it becomes 255. All pictures of
+a camera are looked at before any of them is used, because one picture alone does not tell a label from a matte.
+
+Everything else is refused with the values that were found: other tools' label numbers, labels stretched for viewing,
+labels that a lossy format has blurred.
+"""
+
+import dataclasses
+from collections.abc import Collection
+
+import cv2
+import numpy as np
+
+from nbavatar.errors import DataError
+
+__all__ = ["LABELS", "Meaning", "ValueSurvey"]
+
+LABELS = 3
+"""Largest label."""
+
+_END = 1 / 8  # share of the matte's range that counts as an end
+# Most of the foreground that may lie flat between the ends, and that may lie there at all: in masks of few values and
+# of many, and in coverage, where fine hair and veils are.
+_FEW_VALUES, _MANY_VALUES, _COVERAGE = (0.002, 0.6), (0.05, 0.6), (0.5, 1.0)
+_FEW = 16
+_SOFT = 32  # a matte of more than two values has more than so many levels
+_FULL = 0.75  # a matte whose foreground is above this share of its format's range is not scaled
+_PATCH = 0.002  # share of a picture that is flat and holds labels, when the other pictures are mattes
+_FIX = "store 0 background, 1 head, 2 right hand, 3 left hand as png; or 0 and 255 for the whole person"
+
+
+@dataclasses.dataclass(frozen=True)
+class Meaning:
+    """How a camera's masks are read.
+
+    Attributes:
+        kind: `label` (0..3) or `person` (a matte of the whole person).
+        white: stored value of a matte that stands for full coverage; 0 for labels.
+    """
+
+    kind: str
+    white: int
+
+    def read(self, values: np.ndarray, where: object) -> np.ndarray:
+        """Labels 0..3, or coverage 0..255: uint8 `[H, W]`.
+
+        Args:
+            values: as stored, uint8 or uint16 `[H, W]`.
+            where: file, for the error line.
+
+        Raises:
+            DataError: a value above 3 among labels.
+        """
+        if self.kind == "label":
+            if values.max(initial=0) > LABELS:
+                raise DataError.of(where, "values", expected=f"labels 0..{LABELS}", found=int(values.max()), fix=_FIX)
+            return values.astype(np.uint8)
+        if self.white == 255 and values.dtype == np.uint8:
+            return values
+        scaled = (values.astype(np.uint32) * 255 + self.white // 2) // self.white
+        return np.minimum(scaled, 255).astype(np.uint8)
+
+
+class ValueSurvey:
+    """Which values the pictures of one camera hold, gathered picture by picture in any order."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(1 << 16, np.int64)
+        self._flat = np.zeros(1 << 16, np.int64)
+        self._labelled: list[str] = []
+        self._above = 0
+        self._pictures = 0
+        self._lossy = False
+
+    @property
+    def largest(self) -> int:
+        """Largest value so far, 0 if there is none."""
+        return int(np.flatnonzero(self._counts)[-1]) if self._counts.any() else 0
+
+    def add(self, values: np.ndarray, lossy: bool, name: str) -> None:
+        """Looks at one picture.
+
+        Args:
+            values: uint8 or uint16 `[H, W]`.
+            lossy: whether its format changes values.
+            name: of the picture, for error lines.
+        """
+        top = int(values.max(initial=0))
+        counts = np.bincount(values.reshape(-1))
+        self._counts[: len(counts)] += counts
+        self._pictures += 1
+        self._lossy |= lossy
+        if top == 0:
+            return
+        # Flat are pixels that differ from none of their neighbours by more than a 32nd of the range: the inside of a
+        # region, never an edge, however soft.
+        kernel = np.ones((3, 3), np.uint8)
+        spread = cv2.dilate(values, kernel).astype(np.int32) - cv2.erode(values, kernel)
+        flat = np.bincount(values[spread <= top // 32])
+        self._flat[: len(flat)] += flat
+        if top > LABELS:
+            self._above += 1
+        elif flat[1:].sum() > _PATCH * values.size:
+            self._labelled.append(name)
+
+    def masks(self, where: object, parts: Collection[str]) -> Meaning:
+        """Meaning of masks.
+
+        Args:
+            where: folder or video, for error lines.
+            parts: parts that have a mesh. Masks of 0 and 1 alone are labels where there is a head only, and mattes of
+                the whole person where anything else has a mesh.
+
+        Raises:
+            DataError: neither labels nor a matte, or both.
+        """
+        top = self.largest
+        if top <= LABELS:
+            if self._lossy and top > 0:
+                if not self._labelled:  # a matte that shows nobody, and the noise of its format
+                    return Meaning("person", 255)
+                fix = "store labels as png, or as a video without loss (ffv1 in mkv)"
+                found = f"{self._listed()} in a lossy format, which changes labels along every edge"
+                raise DataError.of(where, "values", expected=f"labels 0..{LABELS} or 0..255", found=found, fix=fix)
+            if top == 1 and set(parts) - {"head"}:
+                return Meaning("person", 1)
+            return Meaning("label", 0)
+        if self._labelled and not self._lossy:
+            found = f"{self._above} of {self._pictures} masks with values above 3, and labels in {self._labelled[0]}"
+            raise DataError.of(where, expected="labels 0..3 in all masks, or 0..255 in all", found=found)
+        few = self._few()
+        expected = "labels 0..3, or a matte: 0, and one value for the person"
+        return Meaning("person", self._white(where, expected, _FEW_VALUES if few else _MANY_VALUES))
+
+    def coverage(self, where: object) -> Meaning:
+        """Meaning of alpha images, which are mattes whatever their values.
+
+        Raises:
+            DataError: no matte.
+        """
+        expected = "coverage: 0, one value where it is full, and others for less of it"
+        return Meaning("person", self._white(where, expected, _COVERAGE) if self.largest else 255)
+
+    def _few(self) -> bool:
+        return not self._lossy and int((self._counts > 0).sum()) <= _FEW
+
+    def _white(self, where: object, expected: str, most: tuple[float, float]) -> int:
+        counts, top = self._counts, self.largest
+        present = np.flatnonzero(counts)
+        full = 255 if top <= 255 else 65535
+        if len(present[present > 0]) == 1:
+            return top
+        peak = _peak(counts, top, full)
+        white = full if peak >= _FULL * full else peak
+        between = np.zeros(len(counts), bool)
+        between[int(peak * _END) + 1 : int(np.ceil(peak * (1 - _END)))] = True
+        between[int(peak * (1 + _END)) + 1 :] = True
+        foreground = counts[int(peak * _END) + 1 :].sum()
+        flat, soft = self._flat[between].sum() / foreground, counts[between].sum() / foreground
+        if white < _SOFT or flat > most[0] or soft > most[1]:
+            raise DataError.of(
+                where,
+                "values",
+                expected=expected,
+                found=self._listed(),
+                fix=self._fix(present) if most != _COVERAGE else "",
+            )
+        return int(white)
+
+    def _fix(self, present: np.ndarray) -> str:
+        levels = [int(v) for v in present if self._flat[v] and v]
+        step = levels[0] if levels else 0
+        if step > 1 and len(levels) <= LABELS and all(v in (step, 2 * step, 3 * step) for v in levels):
+            return f"they look like labels times {step}: divide them by {step}, and store them as png"
+        return _FIX
+
+    def _listed(self) -> str:
+        """The values that are there, those that most pixels hold."""
+        present = np.flatnonzero(self._counts)
+        shown = np.sort(present[np.argsort(-self._counts[present], kind="stable")[:8]])
+        more = f" and {len(present) - len(shown)} others" if len(present) > len(shown) else ""
+        return f"the values {', '.join(map(str, shown))}{more}"
+
+
+def _peak(counts: np.ndarray, top: int, full: int) -> int:
+    """The value above half of the largest one that most pixels have; of 16 bits, the largest one in its 256th part."""
+    upper = counts[: top + 1].copy()
+    upper[: top // 2 + 1] = 0
+    if full == 255:
+        return int(upper.argmax())
+    fine = np.pad(upper, (0, -len(upper) % 256)).reshape(-1, 256)
+    row = int(fine.sum(axis=1).argmax())
+    return 256 * row + int(np.flatnonzero(fine[row])[-1])
