@@ -11,6 +11,7 @@ from nbavatar.errors import DataError
 
 __all__ = ["decode_image", "encode_png", "image_size"]
 
+_FORMATS = ("PNG", "JPEG", "WEBP")
 _ORIENTATION = 0x0112  # tag of EXIF
 
 
@@ -37,7 +38,7 @@ def decode_image(source: bytes | str | os.PathLike[str], name: str | None = None
     """
     label = name or (str(source) if not isinstance(source, bytes) else "image")
     try:
-        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else Path(source)) as image:
+        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else Path(source), formats=_FORMATS) as image:
             if image.mode == "P":
                 return np.array(image)
             if image.mode in ("1", "L", "LA"):
@@ -57,7 +58,7 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
             which way its calibration means it.
     """
     try:
-        with Image.open(Path(path), formats=("PNG", "JPEG", "WEBP")) as image:
+        with Image.open(Path(path), formats=_FORMATS) as image:
             turned = image.getexif().get(_ORIENTATION, 1)
             size = image.size
     except FileNotFoundError as error:
