@@ -25,6 +25,7 @@ VERBS = {
     "tracks": "a subject's parameters, keypoints and meshes -> one mesh sequence",
     "masks": "person matte + meshes -> head and hand labels and coverage",
     "crop": "undistort, crop and resize frames and labels, intrinsics carried along",
+    "segment": "masks from pictures alone: head and hands by SAM 3, or the person by a small network",
     "detect": "keypoints of face and hands in images, for captures that bring none",
     "fit": "multi-view refit of head and hand models",
     "align": "rigid alignment of a capture's meshes to its pictures",

@@ -1,10 +1,10 @@
-"""Options of the keypoint detector."""
+"""Options of the networks that look at pictures: the keypoint detector, the segmenter."""
 
 import dataclasses
 
 from nbavatar.config.core import option
 
-__all__ = ["DetectConfig"]
+__all__ = ["DetectConfig", "SegmentConfig"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,3 +35,18 @@ class DetectConfig:
     )
     sheet_frames: int = option(4, "Frames on the sheet.", min=1, max=64)
     sheet_tile: int = option(320, "Height of a picture on the sheet [px].", min=64, max=2048)
+
+
+@dataclasses.dataclass(frozen=True)
+class SegmentConfig:
+    """Masks from pictures alone."""
+
+    prompts: dict[str, str] = option(
+        {"head": "head", "right_hand": "right hand"},
+        "sam3: what the model is asked for, by part (head, right_hand, left_hand). It follows one object a prompt.",
+    )
+    refine: bool = option(
+        True, "person: look a second time, at the person only, and fit the matte's edge to the picture's."
+    )
+    sheet_frames: int = option(6, "Frames on the picture of each camera.", min=1, max=64)
+    sheet_tile: int = option(320, "Side of a tile of it [px].", min=64, max=2048)

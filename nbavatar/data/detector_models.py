@@ -9,11 +9,12 @@ import hashlib
 import importlib.metadata
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from nbavatar.errors import DependencyError
 
-__all__ = ["GET", "read_detector_models"]
+__all__ = ["GET", "read_detector_models", "read_matting_model"]
 
 PACKAGE = "mediapipe"
 GET = "pip download --no-deps --only-binary=:all: --python-version 3.11 mediapipe==0.10.21"
@@ -36,6 +37,12 @@ _FILES = {
         "11c272b891e1a99ab034208e23937a8008388cf11ed2a9d776ed3d01d0ba00e3",
     ),
 }
+_MATTING = {
+    "person": (
+        "selfie_segmentation/selfie_segmentation.tflite",
+        "9ee168ec7c8f2a16c56fe8e1cfbc514974cbbb7e434051b455635f1bd1462f5c",
+    ),
+}
 _FOLDER = "mediapipe/modules"
 
 
@@ -49,15 +56,24 @@ def read_detector_models(path: str | os.PathLike[str] | None) -> dict[str, bytes
     Raises:
         DependencyError: nothing there, another version, or altered files; the line says how to get the right one.
     """
+    return _read(path, _FILES)
+
+
+def read_matting_model(path: str | os.PathLike[str] | None) -> bytes:
+    """Content of the network that tells a person from the background; arguments and errors as above."""
+    return _read(path, _MATTING)["person"]
+
+
+def _read(path: str | os.PathLike[str] | None, files: Mapping[str, tuple[str, str]]) -> dict[str, bytes]:
     root = _installed() if path is None else Path(path)
     if root.is_dir():
         folder = root / _FOLDER if (root / _FOLDER).is_dir() else root / "modules"
-        found = {name: _file(folder / file) for name, (file, _) in _FILES.items()}
+        found = {name: _file(folder / file) for name, (file, _) in files.items()}
     elif root.is_file():
-        found = _zipped(root)
+        found = _zipped(root, files)
     else:
         raise DependencyError.of(root, expected=f"the wheel or the folder of {PACKAGE}", found="nothing", fix=_how())
-    for name, (file, expected) in _FILES.items():
+    for name, (file, expected) in files.items():
         content = found[name]
         if content is None:
             raise DependencyError.of(root, f"{_FOLDER}/{file}", expected="this file", found="none", fix=_how())
@@ -83,11 +99,11 @@ def _file(path: Path) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def _zipped(path: Path) -> dict[str, bytes | None]:
+def _zipped(path: Path, wanted: Mapping[str, tuple[str, str]]) -> dict[str, bytes | None]:
     try:
         with zipfile.ZipFile(path) as archive:
             names = set(archive.namelist())
-            files = {name: f"{_FOLDER}/{file}" for name, (file, _) in _FILES.items()}
+            files = {name: f"{_FOLDER}/{file}" for name, (file, _) in wanted.items()}
             return {name: archive.read(file) if file in names else None for name, file in files.items()}
     except (zipfile.BadZipFile, EOFError, OSError) as error:
         raise DependencyError.of(
