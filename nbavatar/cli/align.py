@@ -67,6 +67,12 @@ def main(args: argparse.Namespace) -> None:
             for part, motion in align_block(verts, faces, cameras, read, cfg).items():
                 found[part][rows] = np.concatenate([motion.turn, motion.shift], axis=1)
                 motions[part].append(motion)
+    compared = [motion for done in motions.values() for motion in done if np.isfinite(motion.before)]
+    if motions and not compared and any(len(rows) > 1 for rows in pieces):
+        raise DataError.of(
+            args.meshes, expected=f"parts that cameras {', '.join(packs)} see in two frames or more", found="none",
+            fix="do the meshes project into the images? see `nbavatar check`; {\"iterations\": 0} aligns nothing",
+        )  # fmt: skip
     report = {part: summary(done) for part, done in motions.items() if done}
     for part, said in report.items():
         shift, turn = said["shift_mm"], said["turn_deg"]

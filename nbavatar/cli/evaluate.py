@@ -95,7 +95,8 @@ def main(args: argparse.Namespace) -> int:
         with atomic_write(args.csv) as path:
             path.write_text(_csv_text(result["per_image"]), encoding="utf-8")
     shown = ", ".join(f"{name} {value:.4g}" for name, value in result["metrics"].items() if value is not None)
-    print(f"{args.out}: {result['count']} images; {shown}")
+    left_out = f", {result['empty']} of background only left out" if result["empty"] else ""
+    print(f"{args.out}: {result['count']} images{left_out}; {shown}")
     return 0
 
 

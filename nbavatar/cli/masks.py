@@ -77,6 +77,12 @@ def main(args: argparse.Namespace) -> None:
                 out.add("label", frame, label)
                 out.add("alpha", frame, alpha)
             record["pixels"] = dataclasses.asdict(statistics)
+            if statistics.labelled == 0:
+                raise DataError.of(
+                    args.frames, f"camera {camera.name}", expected="pixels of a head or a hand in a frame at least",
+                    found=f"none in {len(frames)} frames, after {statistics.dropped} pixels of mattes were dropped",
+                    fix="do the meshes project onto the masks? see `nbavatar check`; or leave this camera out",
+                )  # fmt: skip
 
 
 def _sorts_clothes(cfg: MasksConfig, pack: FramePack) -> bool:

@@ -87,7 +87,7 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     from nbavatar.avatar.model import Avatar
     from nbavatar.avatar.storage import save_avatar
     from nbavatar.data.sequences import read_sequence
-    from nbavatar.data.views import ViewStore, views_of
+    from nbavatar.data.views import ViewStore, check_views, views_of
     from nbavatar.io.framepack import FramePack
     from nbavatar.training.loop import train
     from nbavatar.training.method import create_method
@@ -97,6 +97,8 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     coords = _read_coords(args.spectral, list(sequence.parts))
     packs = [FramePack(path) for path in args.frames]
     views = views_of(packs, sequence.frames, [pack.split("train") for pack in packs], layers=("rgb", "alpha"))
+    posed = {part: mesh.verts for part, mesh in sequence.parts.items()}
+    check_views(packs, views, posed, mesh_file=args.meshes)
     method = create_method(sequence, coords, views, config, device)
     avatar, net, lpips = method.avatar, method.lpips_net(), None
     if net is not None:

@@ -20,6 +20,7 @@ from nbavatar.data.capture import (
     read_topology,
 )
 from nbavatar.data.capture_masks import CameraMasks, open_masks
+from nbavatar.data.capture_poses import PoseJudge, sampled_frames
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
 from nbavatar.mesh.topology import mesh_defects
@@ -28,7 +29,7 @@ from nbavatar.mesh.zbuffer import rasterize_mesh
 __all__ = ["CaptureReport", "check_capture"]
 
 _SIZES = {"head": (0.1, 0.8), "right_hand": (0.05, 0.7), "left_hand": (0.05, 0.7)}  # plausible diagonals [m]
-_LEAST_OVERLAP = 0.25
+_MUCH_ASTRAY = 0.15  # share of a mesh's pixels off its part, of which a note is made
 
 
 @dataclasses.dataclass
@@ -106,8 +107,11 @@ def check_capture(
             found.attempt("test camera", lambda: stored_test_camera(root, read_rig(root / "cameras.json")))
         _note_on_order(root, splits.frames, report)
     meshes = _check_meshes(root, report, found) if report.topology and report.frames else {}
+    judge = PoseJudge(cameras, report.topology, meshes)
     for camera in cameras.values():
-        _check_camera(Capture(root, cameras), camera, report, meshes, found, progress)
+        _check_camera(Capture(root, cameras), camera, report, meshes, found, judge, progress)
+    if meshes:
+        _check_poses(root, judge, report, found)
     if len(cameras) == 1:
         report.notes.append(f"{root / 'cameras.json'}: one camera only; no camera is left to evaluate on")
     _notes_on_topology(root, report)
@@ -173,11 +177,14 @@ def _check_camera(
     report: CaptureReport,
     meshes: Mapping[str, Mapping[str, np.ndarray]],
     found: _Collector,
+    judge: PoseJudge,
     progress: Callable[[Iterable[str], str], Iterable[str]],
 ) -> None:
     name, overlaps = camera.name, []
     masks_folder = capture.root / "masks" / name
     labels: set[int] = set()
+    sampled = set(sampled_frames(report.frames)) if report.frames else set()
+    marked = False
     masks = found.attempt(f"masks {name}", lambda: open_masks(capture, camera, report.frames))
     if masks is not None:
         report.masks[name] = masks
@@ -193,6 +200,13 @@ def _check_camera(
         if masks is None:
             continue
         mask, alpha = masks.read_mask(frame), masks.read_coverage(frame)
+        labelled = masks.mask is not None and masks.mask.kind == "label"
+        shown = mask if mask is not None else alpha
+        if shown is not None:
+            person = shown if labelled else (shown > MATTE_THRESHOLD).astype(np.uint8)
+            marked = marked or bool(person.any())
+            if frame in sampled:
+                judge.add(name, frame, person, labelled=labelled)
         if mask is None:
             continue
         if masks.mask is not None and masks.mask.kind == "label":
@@ -209,6 +223,12 @@ def _check_camera(
             report.notes.append(f"{masks_folder / frame}: the mask is empty")
         elif frame in meshes:
             overlaps.append(_overlap(camera, report.topology, meshes[frame], there))
+    if report.frames and not marked and masks is not None and (masks.mask or masks.coverage):
+        line = DataError.of(
+            masks_folder, expected="labelled pixels in a frame at least", found="none in any",
+            fix="mend the masks, or leave this camera out of cameras.json",
+        )  # fmt: skip
+        found.note(f"nothing {name}", str(line))
     for value in sorted(labels - {0}):
         part = PARTS[value - 1]
         if report.topology and part not in report.topology:
@@ -217,14 +237,18 @@ def _check_camera(
             found.note(f"label {value}", str(line))
     if overlaps:
         report.overlap[name] = float(np.mean(overlaps))
-        if report.overlap[name] < _LEAST_OVERLAP:
-            line = DataError.of(
-                f"{capture.root / 'cameras.json'}: camera {name}",
-                expected="meshes that project onto the masks",
-                found=f"an overlap of {report.overlap[name]:.0%}",
-                fix="R, t must map world to camera (OpenCV axes), lengths be metres; see the overlay",
+
+
+def _check_poses(root: Path, judge: PoseJudge, report: CaptureReport, found: _Collector) -> None:
+    path = root / "cameras.json"
+    lines = judge.defects(path)
+    for number, line in enumerate(lines):
+        found.note(f"poses {number}", line)
+    for name, astray in judge.misfits().items() if not lines else ():
+        if astray > _MUCH_ASTRAY:
+            report.notes.append(
+                f"{path}: camera {name}: {astray:.0%} of the meshes' pixels are off their part of the masks"
             )
-            found.note(f"overlap {name}", str(line))
 
 
 def _overlap(

@@ -9,7 +9,7 @@ seed and step only, so neither timing nor cache size changes a result.
 import functools
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -17,11 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nbavatar.camera.pinhole import project
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
 from nbavatar.io.framepack import UNSEEN, FramePack
 
-__all__ = ["Sample", "View", "ViewStore", "ViewStream", "shuffled", "views_of"]
+__all__ = ["Sample", "View", "ViewStore", "ViewStream", "check_views", "shuffled", "views_of"]
 
 
 class View(NamedTuple):
@@ -109,6 +110,41 @@ def views_of(
         names = ", ".join(str(pack.path) for pack in packs) or "no frame packs"
         raise DataError.of(names, "split", expected="at least one frame of the split", found="none")
     return views
+
+
+def check_views(
+    packs: Sequence[FramePack], views: Sequence[View], meshes: Mapping[str, np.ndarray], *, mesh_file: str
+) -> None:
+    """Looks for one vertex that projects onto a covered pixel: without any, there is nothing to be learnt.
+
+    Args:
+        packs: opened frame packs with the layer alpha.
+        views: from `views_of`.
+        meshes: part -> vertices `[N, V, 3]` [m, world], a row for each frame of the sequence.
+        mesh_file: named in the error.
+
+    Raises:
+        DataError: no view has a covered pixel, or none has one where the meshes are.
+    """
+    covered = False
+    for index in np.random.default_rng(0).permutation(len(views)):  # nearly always the first will do
+        view = views[index]
+        alpha = packs[view.pack].read("alpha", view.frame)
+        covered = covered or bool(alpha.any())
+        points = np.concatenate([verts[view.row] for verts in meshes.values()]).astype(np.float64)
+        points = points[np.isfinite(points).all(1)]
+        pixels, depth = project(points, view.K.double().numpy(), view.viewmat.double().numpy())
+        x, y = np.floor(np.where(depth[:, None] > 0, pixels, -1.0)).clip(-1, 1 << 20).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < alpha.shape[1]) & (y < alpha.shape[0])
+        if alpha[y[inside], x[inside]].any():
+            return
+    if not covered:
+        where = ", ".join(str(pack.path) for pack in packs)
+        raise DataError.of(where, "alpha", expected="covered pixels in a training view", found=f"none in {len(views)}")
+    raise DataError.of(
+        mesh_file, expected="meshes that project onto the covered pixels of a training view",
+        found=f"none in {len(views)} views", fix="see `nbavatar check` on the capture",
+    )  # fmt: skip
 
 
 def shuffled(step: int, count: int, seed: int) -> int:

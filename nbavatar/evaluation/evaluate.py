@@ -113,10 +113,13 @@ def measure(
         prediction_features: features of the prediction where they are known already.
 
     Returns:
-        metric -> value; None where the foreground is empty, or the image too small for the metric.
+        metric -> value; None where the image is too small for the metric, and everywhere where the foreground is empty:
+        background like background says nothing about an avatar, and would count as a perfect picture.
     """
+    if not bool(mask.any()):
+        return dict.fromkeys(("psnr", "psnr_fg", "ssim", "ssim_fg", *(f"lpips_{name}" for name in truth_features)))
     values: dict[str, float | None] = {"psnr": min(float(psnr(prediction, truth)), PSNR_CAP)}
-    values["psnr_fg"] = min(float(psnr(prediction, truth, mask)), PSNR_CAP) if bool(mask.any()) else None
+    values["psnr_fg"] = min(float(psnr(prediction, truth, mask)), PSNR_CAP)
     similarity = ssim_map(prediction, truth)
     values["ssim"] = float(similarity.mean())
     margin = WINDOW // 2
@@ -153,10 +156,11 @@ def evaluate(
 
     Returns:
         ``per_image`` (list of camera, frame and metrics), ``metrics`` (means over images, psnr etc.), ``count``,
-        ``size`` [W, H], ``digests`` of all predictions and truths, ``trivial`` by answer.
+        ``empty`` (how many of them show nobody, and have no metrics), ``size`` [W, H], ``digests`` of all predictions
+        and truths, ``trivial`` by answer.
 
     Raises:
-        DataError: no pair at all, or a prediction of another size than its truth.
+        DataError: no pair at all, nobody in any truth, or a prediction of another size than its truth.
     """
     with _restored_settings():
         return _evaluate(pairs, background, nets, foreground_threshold, means, trivial, device)
@@ -228,10 +232,17 @@ def _evaluate(
             )
     if size is None:
         raise DataError.of("render", expected="one image or more", found="none")
+    empty = sum(item["psnr"] is None for item in per_image)
+    if empty == len(per_image):
+        raise DataError.of(
+            "truth", "alpha", expected="someone in one of its images at least", found=f"{empty} images of background",
+            fix="look at the masks: is their foreground 255, their coverage a half or more?",
+        )  # fmt: skip
     return {
         "per_image": per_image,
         "metrics": _means(per_image),
         "count": len(per_image),
+        "empty": empty,
         "size": list(size),
         "digests": {name: "sha256:" + digest.hexdigest() for name, digest in seen.items()},
         "trivial": {answer: _means(values) for answer, values in answers.items()},

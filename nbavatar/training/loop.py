@@ -27,6 +27,9 @@ from nbavatar.training.schedule import Plan
 __all__ = ["Store", "train"]
 
 _LOG_EVERY = 25
+# Silhouette loss of billboards and masks that have nothing in common, and in how many logs in a row that is no chance.
+_NOTHING = 0.999
+_NOTHING_LOGS = 8
 _ANCHOR_BYTES = 256_000_000  # most memory for kept face frames
 
 
@@ -77,7 +80,7 @@ def train(
         `parameters` (trained numbers), `model_bytes` (of the avatar's tensors).
 
     Raises:
-        NBAvatarError: too many non-finite steps in a row.
+        NBAvatarError: too many non-finite steps in a row, or nothing is rendered where the masks are.
     """
     avatar = method.avatar
     state = store.load()
@@ -97,6 +100,7 @@ def train(
     previews = _PreviewTimes(config.previews, clock.progress(step))
     stream = ViewStream(views, count, config.seed, config.prefetch)
     last: dict[str, float] = {}
+    nothing = 0
     side = views.side
     saved_at = time.monotonic()
 
@@ -151,6 +155,13 @@ def train(
             if step % _LOG_EVERY == 0 or step == 1 or progress >= 1.0:
                 last = _values(total, terms, plan, clock, skipped)
                 store.log({"step": step, "progress": progress, **_json_safe(last)})
+                nothing = nothing + 1 if last.get("nb", 0.0) >= _NOTHING else 0
+                if nothing >= _NOTHING_LOGS:
+                    raise NBAvatarError(
+                        f"training: the billboards miss the masks in all {nothing} views looked at up to step {step} "
+                        f"(camera {sample.view.camera}, frame {sample.view.frame}: silhouette loss {last['nb']:.4g}); "
+                        "do the meshes project onto the masks? see `nbavatar check`"
+                    )
             if previews.due(progress):
                 store.preview(step, contact_sheet(avatar, views.preview_samples(), vertices))
             if on_step is not None:

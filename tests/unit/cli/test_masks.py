@@ -126,3 +126,13 @@ def test_bad_masks_of_one_s_own(prepared, capfd):
     assert masks(prepared, "--supplied", str(prepared)) == 2
     assert "found none of them" in capfd.readouterr().err
     assert not (prepared / "m.zip").exists()
+
+
+def test_a_camera_without_a_labelled_pixel_stops(prepared, capture_master, capfd):
+    for i in range(5):
+        path = prepared / "own/left" / f"t{i}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.zeros((80, 96), np.uint8)).save(path)
+    assert masks(prepared, "--supplied", str(prepared / "own")) == 2
+    assert "camera left: expected pixels of a head or a hand in a frame at least, found none" in capfd.readouterr().err
+    assert not (prepared / "m.zip").exists()

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from nbavatar.data.views import ViewStore, ViewStream, shuffled, views_of
+from nbavatar.data.views import ViewStore, ViewStream, check_views, shuffled, views_of
 from nbavatar.errors import DataError
 from nbavatar.io.framepack import UNSEEN, FramePack, FramePackWriter
-from tests.scenes.toy import FRAMES, SIZE, write_scene
+from tests.scenes.toy import FRAMES, SIZE, sequence, write_scene
 
 PARTS = ["head", "right_hand"]
 
@@ -124,3 +124,20 @@ def test_store_refuses_pictures_of_another_size(packs) -> None:
     views = [view._replace(width=31) for view in _views(packs)]
     with pytest.raises(DataError, match=r"rgb/f0: expected 31x32, found 32x32"):
         ViewStore(packs, views, PARTS, 0).sample(0)
+
+
+@pytest.mark.parametrize("offset", [(5.0, 0.0, 0.0), (0.0, 0.0, -10.0), (np.nan, 0.0, 0.0)])
+def test_meshes_beside_all_masks_are_refused(packs, offset) -> None:
+    """Aside, behind the cameras, nowhere."""
+    meshes = {name: part.verts for name, part in sequence().parts.items()}
+    check_views(packs, _views(packs), meshes, mesh_file="m.npz")
+    away = {name: verts + np.float32(offset) for name, verts in meshes.items()}
+    with pytest.raises(DataError, match=r"m\.npz: expected meshes that project onto the covered pixels"):
+        check_views(packs, _views(packs), away, mesh_file="m.npz")
+
+
+def test_views_without_a_covered_pixel_are_refused(tmp_path) -> None:
+    empty = [FramePack(path) for path in write_scene(tmp_path, empty=True)["packs"]]
+    meshes = {name: part.verts for name, part in sequence().parts.items()}
+    with pytest.raises(DataError, match="alpha: expected covered pixels in a training view, found none in 9"):
+        check_views(empty, _views(empty), meshes, mesh_file="m.npz")

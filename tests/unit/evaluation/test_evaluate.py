@@ -11,7 +11,7 @@ from skimage.metrics import structural_similarity
 
 from nbavatar.cli import main
 from nbavatar.evaluation.evaluate import composite, mean_images
-from nbavatar.io.framepack import UNSEEN, FramePackWriter
+from nbavatar.io.framepack import UNSEEN, FramePack, FramePackWriter
 
 SIZE = 40
 FRAMES = ["0001", "0002", "0003"]
@@ -272,3 +272,36 @@ def test_mean_images_are_weighted_by_frames_not_by_cameras():
     assert means["a"].max() == 1 and means["b"].max() == 0
     np.testing.assert_allclose(means[""], 2 / 3, rtol=1e-6)
     assert mean_images([], (1, 1, 1)) == {}
+
+
+def _without_anybody(path, frames):
+    """The crop of a camera again, with nobody in some frames."""
+    write_crop(path, "102", 10)
+    with FramePack(path) as pack:
+        kept = {(layer, frame): pack.read(layer, frame) for layer in pack.layers for frame in pack.frames}
+        manifest = pack.manifest
+    with FramePackWriter(path, manifest) as pack:
+        for (layer, frame), picture in kept.items():
+            pack.add(layer, frame, picture // 3 if layer == "alpha" and frame in frames else picture)
+
+
+def test_frames_without_anybody_raise_no_mean(files):
+    """A matte of 85 covers no pixel by half: background against background would count 100 dB."""
+    _without_anybody(files / "102.zip", ["0002"])
+    white = np.full((SIZE, SIZE, 3), 255, np.uint8)
+    write_render(files / "render.zip", {"102/0001": image(1), "102/0002": white})
+    assert run(files, files / "render.zip", extra=FAST) == 0
+    result = json.loads((files / "eval.json").read_text())
+    assert result["count"] == 2 and result["empty"] == 1
+    assert {value for name, value in result["per_image"][1].items() if name not in ("camera", "frame")} == {None}
+    assert result["metrics"]["psnr"] == result["per_image"][0]["psnr"] < 20
+    assert result["trivial"]["background"]["psnr"] < 20
+
+
+def test_an_empty_truth_stops_the_evaluation(files, capfd):
+    _without_anybody(files / "102.zip", FRAMES)
+    white = np.full((SIZE, SIZE, 3), 255, np.uint8)
+    write_render(files / "render.zip", {"102/0001": white, "102/0002": white})
+    assert run(files, files / "render.zip", extra=FAST) == 2
+    assert "truth: alpha: expected someone in one of its images at least" in capfd.readouterr().err
+    assert not (files / "eval.json").exists() and not (files / "eval.csv").exists()

@@ -209,3 +209,15 @@ def test_verb_refuses_a_camera_that_the_meshes_do_not_know(scene: Scene, tmp_pat
     with pytest.raises(DataError, match=r"camera\.b.*found.*a, c"):
         _run(tmp_path, packs, {"iterations": 2})
     assert not (tmp_path / "out.npz").exists()
+
+
+def test_verb_stops_where_no_camera_sees_a_part(scene: Scene, tmp_path) -> None:
+    packs = _write(scene, tmp_path, split=["train"] * FRAMES)
+    sequence, record = read_sequence(tmp_path / "meshes.npz")
+    far = {
+        name: dataclasses.replace(part, verts=part.verts + np.float32(50.0)) for name, part in sequence.parts.items()
+    }
+    write_sequence(tmp_path / "meshes.npz", dataclasses.replace(sequence, parts=far), record)
+    with pytest.raises(DataError, match="expected parts that cameras a, b, c see in two frames or more, found none"):
+        _run(tmp_path, packs, {"iterations": 2})
+    assert not (tmp_path / "out.npz").exists()

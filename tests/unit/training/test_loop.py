@@ -119,6 +119,18 @@ def test_bad_steps_are_skipped_counted_and_end_the_training_with_one_line(scene,
         run(scene, replace(config, max_bad_steps=4), tmp_path / "b", lpips=nowhere)
 
 
+def test_a_training_that_renders_nothing_stops(tmp_path) -> None:
+    meshes = sequence()
+    far = {name: replace(part, verts=part.verts + np.float32(10.0)) for name, part in meshes.parts.items()}
+    scene = write_scene(tmp_path / "scene", meshes=replace(meshes, parts=far))
+    kept = write_scene(tmp_path / "kept")  # its masks are where the person was
+    with pytest.raises(
+        NBAvatarError, match=r"miss the masks in all 8 views .* up to step 175 .*silhouette loss 1"
+    ) as error:
+        run({**scene, "packs": kept["packs"]}, replace(CONFIG, steps=1000), tmp_path / "t")
+    assert "\n" not in str(error.value)
+
+
 def test_a_hundred_times_the_rate_recovers_or_stops_with_a_line(scene, tmp_path) -> None:
     try:
         avatar, _ = run(scene, replace(CONFIG, steps=40, rate_factor=100.0), tmp_path)
