@@ -9,10 +9,9 @@ from PIL import Image
 
 from nbavatar.errors import DataError
 
-__all__ = ["decode_image", "encode_png", "image_size"]
+__all__ = ["decode_image", "encode_png"]
 
 _FORMATS = ("PNG", "JPEG", "WEBP")
-_ORIENTATION = 0x0112  # tag of EXIF
 
 
 def encode_png(image: np.ndarray, *, level: int = 1) -> bytes:
@@ -48,26 +47,3 @@ def decode_image(source: bytes | str | os.PathLike[str], name: str | None = None
         raise DataError.of(label, expected="an image", found="no such file") from error
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError.of(label, expected="a whole image", found=f"one that does not decode ({error})") from error
-
-
-def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Width and height [px] of a stored picture, from its header alone.
-
-    Raises:
-        DataError: missing, not a JPEG, PNG or WebP, or one that viewers turn (EXIF orientation), so that it is not said
-            which way its calibration means it.
-    """
-    try:
-        with Image.open(Path(path), formats=_FORMATS) as image:
-            turned = image.getexif().get(_ORIENTATION, 1)
-            size = image.size
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="an image", found="no such file") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DataError.of(path, expected="a whole image", found=f"one that does not decode ({error})") from error
-    if turned not in (0, 1):
-        raise DataError.of(
-            path, "EXIF orientation", expected="1 (upright)", found=turned,
-            fix="store the picture upright and without the tag, and calibrate with what is stored",
-        )  # fmt: skip
-    return size

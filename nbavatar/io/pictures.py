@@ -17,7 +17,7 @@ from PIL import Image
 
 from nbavatar.errors import DataError
 
-__all__ = ["PICTURE_TYPES", "Plane", "read_colours", "read_plane"]
+__all__ = ["PICTURE_TYPES", "Plane", "picture_size", "read_colours", "read_plane"]
 
 PICTURE_TYPES = (".jpg", ".jpeg", ".png", ".webp")
 """Endings of the files that are read, in lower case."""
@@ -102,6 +102,20 @@ def read_plane(path: str | os.PathLike[str], size: tuple[int, int] | None = None
             found = "floating-point values" if image.mode == "F" else f"a picture of mode {image.mode}"
             raise DataError.of(path, expected="one whole number a pixel", found=found)
         return Plane(_turned(values, turn), lossy)
+
+
+def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Width and height [px], from the file's header alone.
+
+    Raises:
+        DataError: missing, another kind of file, or one that viewers turn (EXIF orientation), so that it is not said
+            which way a calibration by another program means it.
+    """
+    with _opened(path, None) as (image, turn):
+        if turn > 1:
+            fix = "store the picture upright and without the tag, and calibrate with what is stored"
+            raise DataError.of(path, "EXIF orientation", expected="1 (upright)", found=turn, fix=fix)
+        return image.size
 
 
 @contextlib.contextmanager

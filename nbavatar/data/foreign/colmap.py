@@ -12,7 +12,7 @@ from nbavatar.data.foreign.colmap_files import ColmapCamera, ColmapImage, read_c
 from nbavatar.data.foreign.naming import parse_names
 from nbavatar.data.foreign.source import Lens, Shot, Source, inside, picture
 from nbavatar.errors import DataError
-from nbavatar.io.images import image_size
+from nbavatar.io.pictures import picture_size
 from nbavatar.math.rotations import quaternion_to_matrix
 
 __all__ = ["read_colmap"]
@@ -58,7 +58,7 @@ def read_colmap(
             raise DataError.of(where, "camera", expected="a camera of the other file", found=image.camera)
         lens = _lens(cameras[image.camera], image, where, pixel_center)
         file = picture(inside(pictures, image.name, within or root, where), where)
-        size = image_size(file)
+        size = picture_size(file)
         if size != (lens.width, lens.height):
             raise DataError.of(
                 file, "size", expected=f"{lens.width} x {lens.height} as COLMAP says", found=f"{size[0]} x {size[1]}"

@@ -14,7 +14,7 @@ from nbavatar.data.foreign.naming import parse_names
 from nbavatar.data.foreign.source import Lens, Shot, Source, inside, picture
 from nbavatar.data.foreign.transforms import frame_lens, read_transforms
 from nbavatar.errors import DataError
-from nbavatar.io.images import image_size
+from nbavatar.io.pictures import picture_size
 
 __all__ = ["read_nerfstudio"]
 
@@ -58,7 +58,7 @@ def read_nerfstudio(
         mask = None
         if stored is not None:
             mask = picture(inside(path.parent, stored, within or path.parent, f"{where}: mask_path"), where)
-        lens = frame_lens(top, frame, where, image_size(image), pixel_center=pixel_center)
+        lens = frame_lens(top, frame, where, picture_size(image), pixel_center=pixel_center)
         shots.append(Shot(camera, moment, image, mask, undo(lens)))
     return Source(path, shots, inputs={"transforms": path}), moving
 

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from nbavatar.data.foreign.source import PICTURES, Shot, Source
+from nbavatar.data.foreign.source import Shot, Source
 from nbavatar.errors import DataError
-from nbavatar.io.images import image_size
+from nbavatar.io.pictures import PICTURE_TYPES, picture_size
 
 __all__ = ["with_recordings"]
 
@@ -29,8 +29,8 @@ def with_recordings(source: Source, images: Path | None, masks: Path | None) -> 
         shots = []
         for camera, shot in first.items():
             for frame, file in _listed(images, camera).items():
-                if image_size(file) != (shot.lens.width, shot.lens.height):
-                    size = "{} x {}".format(*image_size(file))
+                if picture_size(file) != (shot.lens.width, shot.lens.height):
+                    size = "{} x {}".format(*picture_size(file))
                     raise DataError.of(
                         file, "size", expected=f"{shot.lens.width} x {shot.lens.height} as calibrated", found=size
                     )
@@ -52,10 +52,10 @@ def _listed(folder: Path, camera: str) -> dict[str, Path]:
         raise DataError.of(place, expected=f"a folder with the pictures of camera {camera}", found="none")
     files: dict[str, Path] = {}
     for path in sorted(place.iterdir()):
-        if path.suffix.lower() in PICTURES:
+        if path.suffix.lower() in PICTURE_TYPES:
             if path.stem in files:
                 raise DataError.of(path, expected="one picture a frame", found=f"{files[path.stem].name} too")
             files[path.stem] = path
     if not files:
-        raise DataError.of(place, expected=f"pictures ({', '.join(PICTURES)})", found="none")
+        raise DataError.of(place, expected=f"pictures ({', '.join(PICTURE_TYPES)})", found="none")
     return files

@@ -14,11 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from nbavatar.errors import DataError
+from nbavatar.io.pictures import PICTURE_TYPES
 from nbavatar.names import check_name, name_like
 
 __all__ = ["Lens", "Meshes", "Shot", "Source", "grid", "inside", "natural", "one_lens", "picture", "safe_names"]
-
-PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,7 +205,7 @@ def picture(path: Path, where: str) -> Path:
     Raises:
         DataError: there is none.
     """
-    for candidate in (path, *(path.with_name(path.name + suffix) for suffix in PICTURES)):
-        if candidate.suffix.lower() in PICTURES and candidate.is_file():
+    for candidate in (path, *(path.with_name(path.name + suffix) for suffix in PICTURE_TYPES)):
+        if candidate.suffix.lower() in PICTURE_TYPES and candidate.is_file():
             return candidate
-    raise DataError.of(where, expected=f"a picture ({', '.join(PICTURES)})", found=f"no {path}")
+    raise DataError.of(where, expected=f"a picture ({', '.join(PICTURE_TYPES)})", found=f"no {path}")

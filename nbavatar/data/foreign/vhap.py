@@ -19,7 +19,7 @@ from nbavatar.data.foreign.mesh_files import MeshFiles
 from nbavatar.data.foreign.source import Meshes, Shot, Source, inside, natural, picture
 from nbavatar.data.foreign.transforms import frame_lens, read_transforms
 from nbavatar.errors import DataError
-from nbavatar.io.images import image_size
+from nbavatar.io.pictures import picture_size
 
 __all__ = ["read_vhap"]
 
@@ -63,7 +63,7 @@ def read_vhap(
             matte = None if mask is None else inside(root, mask, allowed, f"{where}: fg_mask_path")
             if matte is not None and not matte.is_file():
                 raise DataError.of(where, "fg_mask_path", expected="a picture", found=f"no {matte}")
-            lens = frame_lens(top, frame, where, image_size(image), pixel_center=pixel_center)
+            lens = frame_lens(top, frame, where, picture_size(image), pixel_center=pixel_center)
             shots.setdefault((camera, moment), Shot(camera, moment, image, matte, lens))
             _note_model(models, frame, moment, root, allowed, where)
             if isinstance(frame.get("timestep_index_original"), int):
