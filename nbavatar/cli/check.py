@@ -134,7 +134,7 @@ def _write_overlays(report: CaptureReport, out: Path) -> None:
         for frame in chosen:
             try:
                 image = read_rgb(capture, camera, frame)
-                mesh = read_mesh(capture.root, frame, report.topology)
+                mesh = read_mesh(capture, frame, report.topology)
             except DataError:
                 continue
             label = _outlined(report.masks.get(camera.name), frame)

@@ -40,8 +40,11 @@ __all__ = [
     "read_rgb",
     "read_splits",
     "read_topology",
+    "recentred",
 ]
 
+_FAR = 10_000.0  # [m]
+_COARSE = 2e-4  # [m]
 _SPLITS = ("frames", "train", "test", "cuts", "test_camera", "contact")
 
 
@@ -52,10 +55,13 @@ class Capture:
     Attributes:
         root: its folder.
         cameras: calibrated cameras by name.
+        origin: where the origin of their world lies in the world of the files [m], float64 `[3]`: zero, unless that one
+            is far away.
     """
 
     root: Path
     cameras: dict[str, Camera]
+    origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
 
     def camera(self, name: str) -> Camera:
         """The camera of this name, or one line that lists those there are."""
@@ -80,7 +86,7 @@ class Splits:
 
 
 def open_capture(root: str | Path, *, pixel_center: float = 0.5) -> Capture:
-    """Reads `cameras.json`.
+    """Reads `cameras.json`; a world whose origin is far from the cameras is recentred.
 
     Args:
         root: folder of the capture.
@@ -88,7 +94,28 @@ def open_capture(root: str | Path, *, pixel_center: float = 0.5) -> Capture:
     """
     root = Path(root)
     path = root / "cameras.json"
-    return Capture(root, {name: camera_of(name, entry, path, pixel_center) for name, entry in read_rig(path).items()})
+    return recentred(root, {name: camera_of(name, entry, path, pixel_center) for name, entry in read_rig(path).items()})
+
+
+def recentred(root: Path, cameras: Mapping[str, Camera]) -> Capture:
+    """A capture whose world begins near its cameras.
+
+    float32 keeps a tenth of a millimetre up to a kilometre only, and geodetic coordinates are millions of metres. So a
+    world whose cameras are on average farther than 10 km from its origin is moved by whole metres, in float64. (Not a
+    nearer one: that would be millimetres taken for metres.)
+    """
+    poses = [camera.cam_from_world for camera in cameras.values()]
+    # Solved, not multiplied by the transpose: a rotation of few digits is not orthogonal enough over such distances.
+    centres = [-np.linalg.solve(pose[:3, :3], pose[:3, 3]) for pose in poses]
+    origin = np.round(np.mean(centres, axis=0)) if centres else np.zeros(3)
+    if np.linalg.norm(origin) <= _FAR:
+        return Capture(root, dict(cameras))
+    moved = {}
+    for name, camera in cameras.items():
+        pose = camera.cam_from_world.copy()
+        pose[:3, 3] += pose[:3, :3] @ origin
+        moved[name] = dataclasses.replace(camera, cam_from_world=pose)
+    return Capture(root, moved, origin)
 
 
 def read_splits(root: Path) -> Splits:
@@ -166,7 +193,8 @@ def read_topology(root: Path) -> dict[str, tuple[np.ndarray, np.ndarray | None]]
             raise DataError.of(path, f"{part}_faces", expected="vertex ids from 0", found=int(faces.min()))
         if rest is not None:
             _check_vertices(rest, faces, path, f"{part}_rest", None)
-        parts[part] = (faces.astype(np.int64), None if rest is None else rest.astype(np.float32))
+            rest = _near(rest, _far_from_origin(rest), path, f"{part}_rest")
+        parts[part] = (faces.astype(np.int64), rest)
     if not parts:
         names = ", ".join(f"{part}_faces" for part in PARTS)
         raise DataError.of(path, expected=f"at least one of {names}", found=f"only {', '.join(arrays) or 'nothing'}")
@@ -174,13 +202,14 @@ def read_topology(root: Path) -> dict[str, tuple[np.ndarray, np.ndarray | None]]
 
 
 def read_mesh(
-    root: Path, frame: str, topology: Mapping[str, tuple[np.ndarray, np.ndarray | None]]
+    capture: Capture, frame: str, topology: Mapping[str, tuple[np.ndarray, np.ndarray | None]]
 ) -> dict[str, np.ndarray]:
     """Reads one frame's vertices, float32 `[V, 3]` [m], of every part (and `head_rigid` where stored).
 
-    A part that the file does not have is not in that frame, and not in the result; one part at least has to be.
+    They are in the world of the capture's cameras. A part that the file does not have is not in that frame, and not in
+    the result; one part at least has to be.
     """
-    path = root / "meshes" / f"{frame}.npz"
+    path = capture.root / "meshes" / f"{frame}.npz"
     arrays, _ = read_arrays(path)
     if not set(topology) & set(arrays):
         found = f"only {', '.join(arrays)}" if arrays else "nothing"
@@ -190,7 +219,7 @@ def read_mesh(
         if name in arrays and (name != "head_rigid" or "head" in topology):
             faces, rest = topology["head" if name == "head_rigid" else name]
             _check_vertices(arrays[name], faces, path, name, None if rest is None else len(rest))
-            result[name] = arrays[name].astype(np.float32)
+            result[name] = _near(arrays[name], capture.origin, path, name)
     if "head_rigid" in result and "head" not in result:
         raise DataError.of(path, "head_rigid", expected="head beside it", found="head_rigid alone")
     if "head_rigid" in result and result["head_rigid"].shape != result["head"].shape:
@@ -234,6 +263,25 @@ def _check_vertices(verts: np.ndarray, faces: np.ndarray, path: Path, name: str,
     if not np.isfinite(verts).all():
         bad = int(np.flatnonzero(~np.isfinite(verts).all(axis=1))[0])
         raise DataError.of(path, name, expected="finite coordinates", found=f"NaN or infinity at vertex {bad}")
+
+
+def _far_from_origin(verts: np.ndarray) -> np.ndarray:
+    """What moves vertices near the origin, in whole metres; zero where they are."""
+    centre = np.round(np.asarray(verts, np.float64).mean(axis=0))
+    return centre if np.linalg.norm(centre) > _FAR else np.zeros(3)
+
+
+def _near(verts: np.ndarray, origin: np.ndarray, path: Path, name: str) -> np.ndarray:
+    """Vertices float32 `[V, 3]` seen from an origin."""
+    moved = verts.astype(np.float64) - origin
+    step = float(np.spacing(np.float32(np.abs(moved).max())))
+    if verts.dtype == np.float32:
+        step = max(step, float(np.spacing(np.abs(verts).max())))
+    if step > _COARSE:
+        fix = "are lengths metres? move the world's origin to the cameras, before anything is rounded to float32"
+        found = f"a world so far from its origin that float32 rounds to {step:.2g} m"
+        raise DataError.of(path, name, expected="vertices near the origin", found=found, fix=fix)
+    return moved.astype(np.float32)
 
 
 def _kind(array: np.ndarray) -> str:

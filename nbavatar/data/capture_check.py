@@ -18,9 +18,11 @@ from nbavatar.data.capture import (
     read_rgb,
     read_splits,
     read_topology,
+    recentred,
 )
 from nbavatar.data.capture_masks import CameraMasks, open_masks
 from nbavatar.data.capture_poses import PoseJudge, sampled_frames
+from nbavatar.data.mesh_checks import mesh_faults
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
 from nbavatar.mesh.topology import mesh_defects
@@ -99,17 +101,22 @@ def check_capture(
     cameras = found.attempt("cameras", lambda: _cameras(root, found)) or {}
     splits = found.attempt("splits", lambda: read_splits(root))
     report.topology = found.attempt("topology", lambda: read_topology(root)) or {}
+    capture = recentred(root, cameras)
+    cameras = capture.cameras
     if cameras:
-        report.capture = Capture(root, cameras)
+        report.capture = capture
+        if capture.origin.any():
+            moved = ", ".join(f"{x:.0f}" for x in capture.origin)
+            report.notes.append(f"{root / 'cameras.json'}: the world's origin is far away; it is moved to ({moved}) m")
     if splits is not None:
         report.frames = splits.frames
         if cameras:
             found.attempt("test camera", lambda: stored_test_camera(root, read_rig(root / "cameras.json")))
         _note_on_order(root, splits.frames, report)
-    meshes = _check_meshes(root, report, found) if report.topology and report.frames else {}
+    meshes = _check_meshes(capture, report, found) if report.topology and report.frames else {}
     judge = PoseJudge(cameras, report.topology, meshes)
     for camera in cameras.values():
-        _check_camera(Capture(root, cameras), camera, report, meshes, found, judge, progress)
+        _check_camera(capture, camera, report, meshes, found, judge, progress)
     if meshes:
         _check_poses(root, judge, report, found)
     if len(cameras) == 1:
@@ -129,10 +136,11 @@ def _cameras(root: Path, found: _Collector) -> dict[str, Camera]:
     return cameras
 
 
-def _check_meshes(root: Path, report: CaptureReport, found: _Collector) -> dict[str, dict[str, np.ndarray]]:
+def _check_meshes(capture: Capture, report: CaptureReport, found: _Collector) -> dict[str, dict[str, np.ndarray]]:
+    root = capture.root
     meshes: dict[str, dict[str, np.ndarray]] = {}
     for frame in report.frames:
-        mesh = found.attempt("meshes", lambda: read_mesh(root, frame, report.topology))  # noqa: B023
+        mesh = found.attempt("meshes", lambda: read_mesh(capture, frame, report.topology))  # noqa: B023
         if mesh is None:
             continue
         first = {name: verts for earlier in reversed(meshes.values()) for name, verts in earlier.items()}
@@ -153,21 +161,16 @@ def _check_meshes(root: Path, report: CaptureReport, found: _Collector) -> dict[
                     found.note(f"size {part}", str(error))
         meshes[frame] = mesh
     if meshes:
-        for part, (faces, _) in report.topology.items():
+        for part, (faces, rest) in report.topology.items():
             mesh = next((mesh for mesh in meshes.values() if part in mesh), None)
             if mesh is None:
                 where, fix = root / "meshes", f"leave {part}_faces out of topology.npz if it is nowhere"
                 found.note(f"absent {part}", str(DataError.of(where, part, expected="vertices", found="none", fix=fix)))
                 continue
-            corners = mesh[part][faces].astype(np.float64) - mesh[part].mean(axis=0)
-            volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-            if volume < 0:
-                where = root / "meshes" / "topology.npz"
-                error = DataError.of(
-                    where, f"{part}_faces", expected="corners counter-clockwise seen from outside", found="clockwise",
-                    fix="swap two columns",
-                )  # fmt: skip
-                found.note(f"winding {part}", str(error))
+            for state in (part, f"{part}_rigid"):
+                of_part = {frame: mesh[state] for frame, mesh in meshes.items() if state in mesh}
+                for line in mesh_faults(root / "meshes", state, faces, rest, of_part) if of_part else ():
+                    found.note(f"surface {part}", line)
     return meshes
 
 

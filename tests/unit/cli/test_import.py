@@ -58,7 +58,7 @@ def test_vhap_with_parameters(tmp_path, flame, capfd, teeth):
     np.testing.assert_array_equal(topology["head"][0], foreign.head_faces())
     for time, verts in enumerate(foreign.heads(teeth=teeth)[1]):
         # Both skin in double precision; the last bit of a single-precision number may round the other way.
-        ours = read_mesh(out, f"{time:05d}", topology)["head"]
+        ours = read_mesh(open_capture(out), f"{time:05d}", topology)["head"]
         np.testing.assert_allclose(ours, verts, rtol=0, atol=1e-7)
     still = foreign.flame_parameters(0, len(verts), teeth=teeth)
     still = {key: value * (key in ("shape", "static_offset", "translation")) for key, value in still.items()}
@@ -84,7 +84,8 @@ def test_vhap_with_meshes(tmp_path, teeth):
     topology = read_topology(out)
     for time in range(foreign.TIMES):
         verts, faces = read_mesh_file(source / "meshes" / f"{time:05d}.obj")
-        np.testing.assert_array_equal(read_mesh(out, f"{time:05d}", topology)["head"], verts.astype(np.float32))
+        ours = read_mesh(open_capture(out), f"{time:05d}", topology)["head"]
+        np.testing.assert_array_equal(ours, verts.astype(np.float32))
         assert len(verts) == len(foreign.heads()[1][0]) + 120 * teeth
     np.testing.assert_array_equal(topology["head"][0], faces)
     np.testing.assert_array_equal(topology["head"][1], read_mesh_file(source / "canonical.obj")[0].astype(np.float32))
@@ -123,7 +124,8 @@ def test_nerfstudio(tmp_path, lens, moved):
     assert_cameras_see_what_the_source_sees(out, lens, rig)
     topology = read_topology(out)
     for time, verts in enumerate(foreign.heads()[1]):
-        np.testing.assert_allclose(read_mesh(out, f"{time:04d}", topology)["head"], verts, rtol=0, atol=1e-7)
+        ours = read_mesh(open_capture(out), f"{time:04d}", topology)["head"]
+        np.testing.assert_allclose(ours, verts, rtol=0, atol=1e-7)
     assert (out / "masks/cam1/0003.png").read_bytes() == (source / "masks/cam1/0003.png").read_bytes()
     if lens is None:
         assert_checks(out)
@@ -184,7 +186,7 @@ def test_one_moving_camera_stands_still_and_the_meshes_move(tmp_path):
     topology = read_topology(out)
     for index, seen in enumerate(foreign.rig()):
         seen = {**seen, "fx": 83.0, "fy": 84.0, "cx": foreign.rig()[0]["cx"], "cy": foreign.rig()[0]["cy"]}
-        verts = read_mesh(out, f"cam{index}", topology)["head"].astype(np.float64)
+        verts = read_mesh(open_capture(out), f"cam{index}", topology)["head"].astype(np.float64)
         pixels, _ = project(verts, camera.K, camera.cam_from_world)
         # Meshes are stored in single precision: 0.5 m at 83 px a metre and 2^-25 of it each way.
         np.testing.assert_allclose(pixels, foreign.expected_pixels(seen, head), rtol=0, atol=2e-5)

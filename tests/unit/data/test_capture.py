@@ -230,13 +230,13 @@ def test_topology_and_vertices_are_checked(capture):
     ]:
         np.savez(capture / "meshes/t1.npz", **{**mesh, **change})
         with pytest.raises(DataError, match=line):
-            read_mesh(capture, "t1", topology)
+            read_mesh(open_capture(capture), "t1", topology)
     np.savez(capture / "meshes/t1.npz", head_rigid=mesh["head_rigid"], right_hand=mesh["right_hand"])
     with pytest.raises(DataError, match="head_rigid: expected head beside it, found head_rigid alone"):
-        read_mesh(capture, "t1", topology)
+        read_mesh(open_capture(capture), "t1", topology)
     np.savez(capture / "meshes/t1.npz", body=mesh["head"])
     with pytest.raises(DataError, match="expected vertices of head or right_hand, found only body"):
-        read_mesh(capture, "t1", topology)
+        read_mesh(open_capture(capture), "t1", topology)
     np.savez(capture / "meshes/topology.npz", faces=np.zeros((1, 3)))
     with pytest.raises(DataError, match="at least one of head_faces"):
         read_topology(capture)
