@@ -19,7 +19,10 @@ __all__ = ["Row", "Subject", "capture_subjects", "read_rows", "read_subjects"]
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
-    """One subject: id, cameras it is trained on, camera it is judged on, folder of its data."""
+    """One subject: id, cameras it is trained on, camera it is judged on, folder of its data.
+
+    A subject that one camera recorded is trained on that and has no camera it is judged on (empty).
+    """
 
     name: str
     train_cameras: tuple[str, ...]
@@ -29,7 +32,7 @@ class Subject:
     @property
     def cameras(self) -> tuple[str, ...]:
         """All cameras, sorted."""
-        return tuple(sorted((*self.train_cameras, self.test_camera)))
+        return tuple(sorted(filter(None, (*self.train_cameras, self.test_camera))))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +56,7 @@ def read_subjects(path: str | os.PathLike[str], root: str) -> dict[str, Subject]
         train = tuple(part.strip() for part in row["train_cameras"].split(",") if part.strip())
         subject = Subject(row["subject"], train, row["test_camera"], root)
         check_name(subject.name, where, "subject", error=ConfigError)
-        for camera in subject.cameras:
+        for camera in (*train, subject.test_camera):
             check_name(camera, where, "camera", error=ConfigError)
         if subject.name in subjects:
             raise ConfigError.of(where, "subject", expected="each subject once", found=f"{subject.name} again")
@@ -73,7 +76,7 @@ def capture_subjects(root: str, test_camera: str | int) -> dict[str, Subject]:
         root: folder of one capture, or of several.
         test_camera: camera to hold out (a number where its id is one); empty for the one that `splits.json` names, or
             else the one whose two nearest neighbours are nearest (by the farther of the two), so that the judged view
-            lies between training views.
+            lies between training views. Of a single camera nothing is held out.
     """
     base = Path(root)
     folders = [base] if (base / "cameras.json").is_file() else sorted(base.glob("*/cameras.json"))
@@ -94,10 +97,8 @@ def capture_subjects(root: str, test_camera: str | int) -> dict[str, Subject]:
         except DataError as error:
             raise ConfigError(str(error)) from error
         centres = {name: camera.centre for name, camera in rig.items()}
-        if len(centres) < 2:
-            raise ConfigError.of(path, expected="two cameras or more", found=len(centres))
         wanted = own if test_camera == "" else choose_camera(test_camera, rig, "test_camera")
-        held_out = wanted or _best_surrounded(centres)
+        held_out = "" if len(rig) == 1 else wanted or _best_surrounded(centres)
         train = tuple(sorted(set(centres) - {held_out}))
         name = check_name(name_like(folder.resolve().name), folder, "name of the folder", error=ConfigError)
         if name in subjects:

@@ -120,7 +120,7 @@ def check_capture(
     if meshes:
         _check_poses(root, judge, report, found)
     if len(cameras) == 1:
-        report.notes.append(f"{root / 'cameras.json'}: one camera only; no camera is left to evaluate on")
+        report.notes.append(f"{root / 'cameras.json'}: one camera only; held-out poses are judged, new views are not")
     _notes_on_topology(root, report)
     found.close()
     return report

@@ -1,5 +1,6 @@
 """What the workflow plans, from nothing."""
 
+import json
 import re
 import subprocess
 import sys
@@ -109,6 +110,17 @@ def test_capture_without_a_folder_says_which_option_to_give(project):
     out = project.snakemake("-n", config="config/capture.yaml")
     assert out.returncode != 0
     assert "--config data_root=" in out.stdout + out.stderr
+
+
+def test_a_single_camera_is_trained_on_and_judged_on_poses_only(project, tmp_path):
+    root = write_capture(tmp_path / "toy")
+    cameras = json.loads((root / "cameras.json").read_text())
+    (root / "cameras.json").write_text(json.dumps({"c0": cameras["c0"]}))
+    jobs = project.plan("--config", f"data_root={root}", config="config/capture.yaml")
+    assert jobs["train"] == jobs["crop"] == jobs["render"] == jobs["evaluate"] == 1
+    assert (jobs["table"], jobs["figure"]) == (2, 2), "held-out poses and speed; poses and training"
+    out = project.snakemake("-n", "stage_tradeoff", "--config", f"data_root={root}", config="config/capture.yaml")
+    assert out.returncode != 0 and "take a protocol of split self_reenactment" in out.stdout + out.stderr
 
 
 def test_methods_are_laid_over_a_capture(project, tmp_path):

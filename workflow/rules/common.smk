@@ -17,6 +17,13 @@ from nbavatar.config.tables import read_tables
 from nbavatar.errors import NBAvatarError, did_you_mean
 from nbavatar.provenance import code_digest
 
+
+def novel(protocol):
+    """Whether a protocol judges the camera that is held out."""
+    known = RUN.protocols.get(protocol)
+    return known is not None and known.split == "novel_view"
+
+
 try:
     RUN = load_run(config)
     if RUN.layout == "capture":
@@ -35,6 +42,23 @@ try:
                 )
     TABLES = read_tables(RUN.tables)
     FIGURES = read_figures(RUN.figures) if RUN.figures else {}
+    # Where one camera recorded a subject none is held out: there are no novel views of it to judge, or to show.
+    ROWS = [
+        row
+        for row in ROWS
+        if SUBJECTS[row.subject].test_camera or not novel(row.protocol)
+    ]
+    if not any(subject.test_camera for subject in SUBJECTS.values()):
+        TABLES = {
+            name: table
+            for name, table in TABLES.items()
+            if table.speeds or not all(map(novel, table.protocols))
+        }
+        FIGURES = {
+            name: figure
+            for name, figure in FIGURES.items()
+            if not novel(figure.protocol)
+        }
     for pair in RUN.reenact:
         for name in pair.split("/"):
             if name not in SUBJECTS:
@@ -216,7 +240,13 @@ def fitted_of(subject):
 
 def frames_under(protocol, subject):
     """Crops that a protocol looks at: the held-out camera for novel views, the training cameras for held-out poses."""
-    protocol, cameras = RUN.protocols[protocol], SUBJECTS[subject]
+    cameras = SUBJECTS[subject]
+    if novel(protocol) and not cameras.test_camera:
+        raise WorkflowError(
+            f"{subject}: one camera recorded it, and none is held out for protocol '{protocol}'; "
+            "take a protocol of split self_reenactment"
+        )
+    protocol = RUN.protocols[protocol]
     cameras = (
         [cameras.test_camera]
         if protocol.split == "novel_view"

@@ -26,6 +26,7 @@ def test_camera_ids_stay_text(tmp_path):
     [
         (HEADER + "S1\t110,102\t102\n", "without the test camera"),
         (HEADER + "S1\t\t102\n", "found none"),
+        (HEADER + "S1\t102\t\n", "camera: expected a name"),
         (HEADER + "S1\t1\t2\nS1\t1\t2\n", "S1 again"),
         (HEADER + "S/1\t1\t2\n", "a name of letters"),
         (HEADER + "S1\t1\n", "3 columns"),
@@ -63,6 +64,14 @@ def test_capture_holds_out_the_best_surrounded_camera_unless_told(tmp_path):
     assert chosen.test_camera == "a"
     assert chosen.train_cameras == ("b", "c", "d", "e")
     with pytest.raises(ConfigError, match="unknown camera 'z'"):
+        capture_subjects(str(tmp_path / "demo"), "z")
+
+
+def test_nothing_is_held_out_of_a_single_camera(tmp_path):
+    _capture(tmp_path / "demo", {"a": 0.0})
+    subject = capture_subjects(str(tmp_path / "demo"), "")["demo"]
+    assert (subject.cameras, subject.train_cameras, subject.test_camera) == (("a",), ("a",), "")
+    with pytest.raises(ConfigError, match="test_camera: unknown camera 'z'"):
         capture_subjects(str(tmp_path / "demo"), "z")
 
 
