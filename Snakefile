@@ -1,9 +1,18 @@
 # The only entry: `snakemake` plans and runs what config/paper.yaml (or --configfile) describes.
 # What depends on what is in workflow/rules; what is computed is in the Python package.
 
+import importlib.util
+
+from snakemake.exceptions import WorkflowError
 from snakemake.utils import min_version
 
 min_version("9.20")
+
+if importlib.util.find_spec("nbavatar") is None:
+    raise WorkflowError(
+        "the Python package nbavatar is not installed beside this snakemake; run `make install` and use "
+        '.venv/bin/snakemake, or: python -m pip install "nbavatar[pipeline]"'
+    )
 
 # A configuration given on the command line replaces the paper's as a whole; nothing is merged under it.
 if "run" not in config:
@@ -14,7 +23,7 @@ if "run" not in config:
 report: "workflow/report/workflow.rst"
 
 
-container: "docker://docker.io/library/nbavatar:0.1.0"
+container: "docker://ghcr.io/nbavatar/nbavatar:0.1.0"
 
 
 include: "workflow/rules/common.smk"

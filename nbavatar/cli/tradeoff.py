@@ -22,6 +22,7 @@ and substeps, refit, spectral modes, coarser meshes.
 
 import argparse
 import math
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -34,7 +35,7 @@ from nbavatar.config.core import to_mapping
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.config.tradeoff import TradeoffConfig, read_sheet
 from nbavatar.devices import lease_device
-from nbavatar.errors import ConfigError, DataError
+from nbavatar.errors import ConfigError, DataError, DependencyError
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import write_json
 from nbavatar.provenance import code_digest, file_digest, run_record
@@ -95,15 +96,22 @@ def _offline(args: argparse.Namespace, sheet: TradeoffConfig) -> int:
     out = Path(args.out)
     sequence, _ = read_sequence(args.meshes)
     o = sheet.offline
-    stages = chain(contact_rows(sequence, o), refit_rows(o), spectral_rows(sequence, o), decimation_rows(sequence, o))
-    rows = list(progress(stages, "offline stages"))
+    rows = list(progress(chain(contact_rows(sequence, o), refit_rows(o), spectral_rows(sequence, o)), "offline stages"))
+    lacking = ""
+    try:
+        rows += progress(decimation_rows(sequence, o), "coarser meshes")
+    except DependencyError as error:  # pymeshlab wants libraries of the system; the other stages do not depend on it
+        lacking = str(error)
+        print(f"nbavatar tradeoff: warning: no coarser meshes are measured: {lacking}", file=sys.stderr)
     _write(out / "offline.csv", rows_csv(rows))
     _write(out / "offline.md", offline_markdown(rows))
     for suffix in ("png", "pdf"):
         with atomic_write(out / f"offline.{suffix}") as path:
             save_figure(offline_figure(rows), path)
     record = run_record("tradeoff", config=to_mapping(o), inputs={"meshes": args.meshes}, device=timed_device("cpu"))
-    write_json(out / "offline.json", {"kind": "offline", "format": 1, "rows": rows, "record": record})
+    write_json(
+        out / "offline.json", {"kind": "offline", "format": 1, "rows": rows, "lacking": lacking, "record": record}
+    )
     print(f"{out}/offline.md: {len(rows)} rows")
     return 0
 

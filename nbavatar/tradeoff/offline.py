@@ -20,7 +20,7 @@ import numpy as np
 from nbavatar.config.geometry import DeformConfig, FitConfig
 from nbavatar.config.tradeoff import OfflineConfig
 from nbavatar.data.sequences import MeshSequence
-from nbavatar.errors import DataError
+from nbavatar.errors import DataError, require
 from nbavatar.mesh.bvh import DeformingMesh, surface_points
 from nbavatar.tradeoff.contact import ContactScene, contact_scene
 
@@ -105,8 +105,7 @@ def spectral_rows(sequence: MeshSequence, sheet: OfflineConfig) -> Iterator[dict
 
 def decimation_rows(sequence: MeshSequence, sheet: OfflineConfig) -> Iterator[dict[str, Any]]:
     """Coarser meshes of all parts: faces left, and how far the original is from them over the sequence."""
-    import pymeshlab  # noqa: F401  (its own start takes seconds, and is no part of the stage)
-
+    require("pymeshlab", "pymeshlab", "coarser meshes")  # its own start takes seconds, and is no part of the stage
     frames = np.unique(np.linspace(0, len(sequence.frames) - 1, sheet.decimate_frames).astype(int))
     for share in sheet.decimate_shares:
         began = time.perf_counter()

@@ -63,5 +63,7 @@ def offline_section(result: Mapping[str, Any], table: str) -> Section:
     for (stage, knob), rows in groups.items():
         steps = ", ".join(f"{row['value']:g}: {row['error_mm']:.2f} mm in {row['ms']:.0f} ms" for row in rows)
         paragraphs.append(f"{stage.capitalize()}, {knob} ({rows[0]['meaning']}): {steps}.")
+    if result.get("lacking"):
+        paragraphs.append(f"Coarser meshes were not measured: {result['lacking']}.")
     figures = [("offline.png", "Error of the stages before training against their time, by knob.")]
     return Section("Stages before training", paragraphs, table, figures)

@@ -34,6 +34,57 @@ def test_a_broken_package_is_named_with_the_verbs_that_need_it(tmp_path, capsys,
     assert "MISSING    opencv-contrib-python-headless: libGL.so.1" in text and "pip install opencv" in text
 
 
+def _without(monkeypatch, **reasons):
+    """Imports of these modules fail with these reasons."""
+    real = doctor.importlib.import_module
+
+    def broken(name, *more):
+        if name in reasons:
+            raise ImportError(reasons[name])
+        return real(name, *more)
+
+    monkeypatch.setattr(doctor.importlib, "import_module", broken)
+
+
+def test_brief_is_one_line_that_all_is_well(tmp_path, capsys):
+    assert main(["doctor", "--brief", "--root", str(tmp_path)]) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("doctor: ") and "a kernel compiles" in line
+
+
+def test_brief_is_one_line_that_names_what_is_missing_and_what_to_do(tmp_path, capsys, monkeypatch):
+    _without(monkeypatch, torch="libcudnn.so.9: cannot open shared object file")
+    assert main(["doctor", "--brief", "--root", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line == (
+        "doctor: torch cannot be imported: libcudnn.so.9: cannot open shared object file; "
+        "run: python -m pip install torch"
+    )
+
+
+def test_a_library_of_the_system_that_pymeshlab_lacks_limits_one_part_only(tmp_path, capsys, monkeypatch):
+    _without(monkeypatch, pymeshlab="libGL.so.1: cannot open shared object file")
+    assert main(["doctor", "--brief", "--root", str(tmp_path)]) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert "a kernel compiles" in first and "tradeoff --offline" in second and "apt-get install libgl1" in second
+    assert main(["doctor", "--json", "--root", str(tmp_path)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["limited"] and "tradeoff" not in [v for v, names in found["verbs"].items() if names]
+
+
+def test_a_package_that_pip_has_not_installed_is_no_mere_limit(tmp_path, monkeypatch):
+    _without(monkeypatch, pymeshlab="No module named 'pymeshlab'")
+    monkeypatch.setattr(doctor, "installed", lambda name: False)
+    found = doctor.examine(tmp_path)
+    assert found["missing"] == ["pymeshlab"] and not found["limited"]
+
+
+def test_a_compiler_that_does_not_work_counts(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "_kernel_problem", lambda: "LLVM ERROR: no such target")
+    assert main(["doctor", "--brief", "--root", str(tmp_path)]) == 2
+    assert "LLVM ERROR" in capsys.readouterr().out
+
+
 def test_needs_of_a_verb_are_read_from_its_code():
     assert {"cv2", "numpy", "numba"} <= doctor.third_party("masks")
     assert "cv2" not in doctor.third_party("train")

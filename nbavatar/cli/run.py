@@ -1,0 +1,138 @@
+"""The whole pipeline in one command, in the folder you are in.
+
+    nbavatar run smoke               a tiny synthetic subject through every stage, minutes on two cores
+    nbavatar run capture FOLDER      an avatar, metrics, pictures and a report of your own capture
+    nbavatar run paper               every table of the paper; needs the Decaf dataset and the body models
+
+The first call copies the configuration files (`config/`) and the page that says where data belongs
+(`resources/README.md`) into this folder, where you can edit them; files that are there already are left as they are.
+Results go to `results/<run>/`, logs to `logs/<run>/`. The same command again does only what is not done yet. What
+follows `--` goes to snakemake: `-- -n` shows what would run, `-- subject_S2` makes one subject, `-- --configfile FILE`
+takes other options. Needs the packages of the extra `pipeline`.
+"""
+
+import argparse
+import contextlib
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from nbavatar.errors import DataError, DependencyError
+from nbavatar.packages import install_line
+
+__all__ = ["add_arguments", "copy_configuration", "main", "pipeline_folder"]
+
+_WHAT = {
+    "smoke": "a tiny synthetic subject through every stage",
+    "capture": "train and evaluate an avatar on your own capture",
+    "paper": "every table of the paper",
+}
+_OURSELVES = (sys.executable, "-m", "nbavatar")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the options."""
+    what = parser.add_subparsers(dest="what", required=True, metavar="smoke|capture|paper")
+    for name, text in _WHAT.items():
+        own = what.add_parser(name, help=text, description=text)
+        if name == "capture":
+            own.add_argument("folder", metavar="FOLDER", help="the capture")
+        own.add_argument("--cores", type=int, metavar="N", help="processors to use (default: all)")
+        own.add_argument("snakemake", nargs="*", metavar="-- WORDS", help="further words for snakemake")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Runs snakemake on the workflow; its exit code."""
+    if args.what == "capture" and not Path(args.folder).is_dir():
+        raise DataError.of(args.folder, expected="a capture's folder", found="none")
+    if importlib.util.find_spec("snakemake") is None:
+        raise DependencyError(f"nbavatar run needs snakemake, which is not installed; {install_line('snakemake')}")
+    source, here = pipeline_folder(), Path.cwd()
+    for path in copy_configuration(source, here):
+        print(f"{path}: written, yours to edit")
+    if args.what == "paper":
+        check = [*_OURSELVES, "check", "--layout", "decaf", "resources/DecafDataset"]
+        code = _call(check)
+        if code:
+            return code
+    code = _call(_command(args, source))
+    report = here / "results" / args.what / "report" / "index.html"
+    if code == 0 and report.is_file() and not args.snakemake:
+        if args.what == "smoke":
+            for table in sorted((here / "results" / "smoke" / "tables").glob("*.md")):
+                print(table.read_text(encoding="utf-8"))
+        print(f"report: {report.relative_to(here)}")
+    return code
+
+
+def _call(words: list[str]) -> int:
+    """Runs a command to its end; its exit code.
+
+    An interrupt from the keyboard reaches it too: it is left to end in its own way, since Snakemake then removes its
+    lock of the folder. A request to terminate is passed on.
+    """
+    with subprocess.Popen(words) as process:
+        signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+        while True:
+            with contextlib.suppress(KeyboardInterrupt):
+                code = process.wait()
+                return code if code >= 0 else 128 - code
+
+
+def _command(args: argparse.Namespace, source: Path) -> list[str]:
+    cores = str(args.cores or os.cpu_count() or 2)
+    words = [sys.executable, "-m", "snakemake", "--snakefile", str(source / "Snakefile"), "--cores", cores]
+    if args.what == "smoke":
+        # Its jobs take a second or two each: the profile and `nbavatar warm` are for such.
+        words = [*_OURSELVES, "warm", "--", *words, "--workflow-profile", str(source / "profiles" / "ci")]
+    words += args.snakemake
+    if "--configfile" not in args.snakemake:
+        words += ["--configfile", f"config/{args.what}.yaml"]
+    if args.what == "capture":
+        # As a quoted text: snakemake reads values as YAML, where a folder may look like a number.
+        words += ["--config", f"data_root={json.dumps(args.folder, ensure_ascii=False)}"]
+    return words
+
+
+def pipeline_folder() -> Path:
+    """The folder that holds Snakefile, workflow/, config/ and profiles/: the wheel's, or the repository's.
+
+    Raises:
+        DependencyError: neither is there, as with modules that were copied by hand.
+    """
+    package = Path(__file__).resolve().parent.parent
+    for folder in (package / "pipeline", package.parent):
+        if (folder / "Snakefile").is_file() and (folder / "workflow").is_dir():
+            return folder
+    raise DependencyError(
+        f"the workflow is neither in {package / 'pipeline'} nor in {package.parent}; install the wheel again, "
+        "or clone the repository"
+    )
+
+
+def copy_configuration(source: Path, here: Path) -> list[Path]:
+    """Copies the configuration and the page about data into a folder, where they are not there yet.
+
+    Args:
+        source: `pipeline_folder()`.
+        here: the user's folder.
+
+    Returns:
+        The files written, relative to `here`; none where `here` is the repository itself.
+    """
+    written = []
+    for path in sorted([*(source / "config").rglob("*"), source / "resources" / "README.md"]):
+        name = path.relative_to(source)
+        if not path.is_file() or (here / name).exists() or (here / name).is_symlink():
+            continue
+        (here / name).parent.mkdir(parents=True, exist_ok=True)
+        part = here / name.with_name(f".{name.name}.part")
+        shutil.copyfile(path, part)
+        part.replace(here / name)
+        written.append(name)
+    return written

@@ -1,0 +1,108 @@
+"""`nbavatar run`: what it hands to snakemake, what it copies, and what it never touches."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from nbavatar.cli import main, run
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Commands that would run; each ends well."""
+    seen: list[list[str]] = []
+
+    def call(words):
+        seen.append(list(words))
+        return 0
+
+    monkeypatch.setattr(run, "_call", call)
+    return seen
+
+
+def test_the_repository_is_found_and_nothing_is_copied_into_it():
+    assert run.pipeline_folder() == ROOT
+    assert run.copy_configuration(ROOT, ROOT) == []
+
+
+def test_configuration_is_copied_once_and_what_is_there_is_kept(tmp_path):
+    (tmp_path / "config").mkdir()
+    (tmp_path / "config" / "smoke.yaml").write_text("mine", encoding="utf-8")
+    (tmp_path / "config" / "paper.yaml").symlink_to(tmp_path / "elsewhere")
+    written = {str(path) for path in run.copy_configuration(ROOT, tmp_path)}
+    assert {"config/capture.yaml", "config/capture/runs.tsv", "resources/README.md"} <= written
+    assert (tmp_path / "config" / "smoke.yaml").read_text(encoding="utf-8") == "mine"
+    assert not (tmp_path / "elsewhere").exists(), "a link of the user's is not written through"
+    assert run.copy_configuration(ROOT, tmp_path) == []
+
+
+def test_smoke_is_warm_and_takes_its_profile(calls, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "smoke", "--cores", "2", "--", "-n"]) == 0
+    ((*head, flag, value),) = calls
+    assert head[:5] == [sys.executable, "-m", "nbavatar", "warm", "--"]
+    assert str(ROOT / "Snakefile") in head and head[head.index("--cores") + 1] == "2" and "-n" in head
+    assert (flag, value) == ("--configfile", "config/smoke.yaml")
+    assert (tmp_path / "config" / "smoke.yaml").is_file()
+
+
+def test_a_capture_is_handed_over_as_text_whatever_its_name(calls, tmp_path, monkeypatch):
+    """Snakemake reads `--config` values as YAML: `007` would be a number, `a: b` a mapping."""
+    import yaml
+
+    monkeypatch.chdir(tmp_path)
+    for name in ("007", "a b", "null", "o'neil", 'say "cheese"', "頭"):
+        Path(name).mkdir()
+        assert main(["run", "capture", name]) == 0
+        key, _, value = calls[-1][-1].partition("=")
+        assert key == "data_root" and yaml.safe_load(value) == name
+
+
+def test_own_configuration_replaces_ours(calls, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("data").mkdir()
+    words = ["--configfile", "config/capture.yaml", "config/methods.yaml"]
+    assert main(["run", "capture", "data", "--", *words]) == 0
+    assert calls[-1].count("--configfile") == 1 and calls[-1][-5:-2] == words
+
+
+def test_paper_stops_where_the_data_is_missing(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "paper"]) == 2
+    assert "resources/DecafDataset" in capfd.readouterr().err
+
+
+def test_a_missing_folder_and_a_missing_snakemake_are_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "capture", "nowhere"]) == 2
+    assert capsys.readouterr().err.strip() == "nbavatar run: error: nowhere: expected a capture's folder, found none"
+    monkeypatch.setattr(run.importlib.util, "find_spec", lambda name: None)
+    assert main(["run", "smoke"]) == 2
+    assert 'python -m pip install "nbavatar[pipeline]"' in capsys.readouterr().err
+    assert not list(tmp_path.iterdir()), "nothing is written before it is known that it can run"
+
+
+def test_an_interrupt_leaves_the_command_time_to_end(tmp_path):
+    """Snakemake removes its lock when it is interrupted; a caller that kills it at once leaves the folder locked."""
+    child = (
+        "import signal, sys, time, pathlib\n"
+        "def end(*_): time.sleep(1); pathlib.Path('ended').touch(); sys.exit(3)\n"
+        "signal.signal(signal.SIGINT, end)\n"
+        "pathlib.Path('ready').touch(); time.sleep(60)\n"
+    )
+    call = f"sys.exit(run._call([sys.executable, '-c', {child!r}]))"
+    code = f"import sys; from nbavatar.cli import run; {call}"
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, start_new_session=True)
+    for _ in range(300):
+        if (tmp_path / "ready").exists():
+            break
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=60) == 3 and (tmp_path / "ended").exists()
