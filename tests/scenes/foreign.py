@@ -83,25 +83,27 @@ def flame_parameters(time: int, verts: int, *, teeth: bool = False) -> dict[str,
 
 
 def posed_head(parameters: dict[str, np.ndarray]) -> np.ndarray:
-    """The vertices float64 `[V, 3]` that skinning by the package smplx makes of the parameters; no code of ours."""
-    import torch
-    from smplx.lbs import lbs
-
+    """The vertices float64 `[V, 3]` of FLAME's published equations, written out joint by joint; no code of ours."""
     content = flame()
-    tensor = {key: torch.tensor(content[key]) for key in ("v_template", "shapedirs", "posedirs", "weights")}
-    count = len(tensor["v_template"])
-    flat = {key: torch.tensor(value, dtype=torch.float64).reshape(1, -1) for key, value in parameters.items()}
-    template = tensor["v_template"][None]
+    values = {key: value.astype(np.float64).ravel() for key, value in parameters.items()}
+    shaped = content["v_template"] + content["shapedirs"] @ np.concatenate([values["shape"], values["expr"]])
     for key in ("static_offset", "dynamic_offset"):
-        if key in flat:
-            template = template + flat[key].reshape(1, -1, 3)[:, :count]
-    pose = torch.cat([flat[key] for key in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")], dim=1)
-    verts, _ = lbs(
-        torch.cat([flat["shape"], flat["expr"]], dim=1), pose, template, tensor["shapedirs"],
-        tensor["posedirs"].reshape(-1, tensor["posedirs"].shape[-1]).T,
-        torch.tensor(content["J_regressor"].toarray()), torch.tensor([-1, 0, 1, 1, 1]), tensor["weights"],
-    )  # fmt: skip
-    return (verts[0] + flat["translation"]).numpy()
+        if key in values:
+            shaped = shaped + values[key].reshape(-1, 3)[: len(shaped)]
+    joints = content["J_regressor"].toarray() @ shaped
+    angles = np.concatenate([values[key] for key in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")]).reshape(5, 3)
+    turns = Rotation.from_rotvec(angles).as_matrix()
+    posed = shaped + content["posedirs"] @ (turns[1:] - np.eye(3)).ravel()
+    moves: list[np.ndarray] = []
+    for joint, parent in enumerate((None, 0, 1, 1, 1)):
+        local = np.eye(4)
+        local[:3, :3] = turns[joint]
+        local[:3, 3] = joints[joint] - (0 if parent is None else joints[parent])
+        moves.append(local if parent is None else moves[parent] @ local)
+    result = np.zeros_like(posed)
+    for joint, move in enumerate(moves):
+        result += content["weights"][:, joint, None] * ((posed - joints[joint]) @ move[:3, :3].T + move[:3, 3])
+    return result + values["translation"]
 
 
 def head_faces() -> np.ndarray:

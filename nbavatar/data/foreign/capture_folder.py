@@ -21,6 +21,7 @@ from nbavatar.io.records import write_json
 
 __all__ = ["write_capture", "write_meshes"]
 
+_FAR = 100.0  # [m]
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 
@@ -114,7 +115,7 @@ def write_meshes(
         for part, (faces, rest) in meshes.topology().items():
             arrays[f"{part}_faces"] = faces
             if rest is not None:
-                arrays[f"{part}_rest"] = rest
+                arrays[f"{part}_rest"] = _stored(rest)
         write_arrays(folder / "topology.npz", arrays, {"units": "m"})
         for theirs, ours in progress(list(frames.items()), "meshes"):
             parts = dict(meshes.vertices(theirs))
@@ -125,11 +126,14 @@ def write_meshes(
                 )  # fmt: skip
             if poses:
                 pose = poses[theirs]
-                parts = {
-                    part: (verts.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-                    for part, verts in parts.items()
-                }
-            write_arrays(folder / f"{ours}.npz", parts, {"units": "m"})
+                parts = {part: verts @ pose[:3, :3].T + pose[:3, 3] for part, verts in parts.items()}
+            stored = {part: _stored(verts) for part, verts in parts.items()}
+            write_arrays(folder / f"{ours}.npz", stored, {"units": "m"})
+
+
+def _stored(verts: np.ndarray) -> np.ndarray:
+    """Single precision, unless the world's origin is so far away that it would cost a hundredth of a millimetre."""
+    return verts if np.abs(verts).max(initial=0.0) > _FAR else verts.astype(np.float32)
 
 
 def _refuse_taken(out: Path) -> None:

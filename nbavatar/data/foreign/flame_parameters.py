@@ -86,7 +86,7 @@ class FlameSequence:
         return result
 
     def _pose(self, values: Mapping[str, np.ndarray], *, rest: bool = False) -> np.ndarray:
-        """Vertices float32 `[V, 3]` of one frame, or of its subject at rest."""
+        """Vertices float64 `[V, 3]` of one frame, or of its subject at rest."""
         mesh = self._flame.mesh
         for key in _OFFSETS:
             if key in values and not (rest and key == "dynamic_offset"):
@@ -100,4 +100,4 @@ class FlameSequence:
             given["shape"], given["expr"], given["jaw_pose"], root=given["rotation"], neck=given["neck_pose"],
             eyes=given["eyes_pose"],
         )  # fmt: skip
-        return (posed.verts[0] + given["translation"][0]).numpy().astype(np.float32)
+        return (posed.verts[0] + given["translation"][0]).numpy()

@@ -78,7 +78,7 @@ class MeshFiles:
                 path, "faces", expected=f"those of {first}, in their order", found="others",
                 fix="all frames need one topology; remesh none of them on its own",
             )  # fmt: skip
-        return (verts * self._scale).astype(np.float32)
+        return verts * self._scale
 
 
 class JoinedMeshes:

@@ -64,11 +64,11 @@ class Meshes(Protocol):
     """Posed meshes of a source."""
 
     def topology(self) -> Mapping[str, tuple[np.ndarray, np.ndarray | None]]:
-        """Part -> faces int64 `[F, 3]`, rest vertices float32 `[V, 3]` [m] or None."""
+        """Part -> faces int64 `[F, 3]`, rest vertices float64 `[V, 3]` [m] or None."""
         ...
 
     def vertices(self, frame: str) -> Mapping[str, np.ndarray]:
-        """Part -> float32 `[V, 3]` [m, world] of the parts that are in a frame (as the source calls it)."""
+        """Part -> float64 `[V, 3]` [m, world] of the parts that are in a frame (as the source calls it)."""
         ...
 
 

@@ -445,3 +445,22 @@ def test_pycolmap_reads_the_same(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     source = foreign.write_colmap(tmp_path / "colmap", binary=True, model="OPENCV", lens=LENSES["OPENCV"])
     assert len(pycolmap.Reconstruction(str(source / "sparse/0")).images) == 15
+
+
+def test_worlds_far_from_their_origin_keep_their_millimetres(tmp_path):
+    """Coordinates of a map: 5,000 km away float32 holds half a metre."""
+    far, source = np.array([4.2e6, 1.7e5, 4.8e6]), foreign.write_nerfstudio(tmp_path / "ns")
+
+    def move(top):
+        for frame in top["frames"]:
+            for axis in range(3):
+                frame["transform_matrix"][axis][3] += far[axis]
+
+    edit(source / "transforms.json", move)
+    for time, verts in enumerate(foreign.heads()[1]):
+        foreign.write_obj(tmp_path / "meshes" / f"{time}.obj", verts + far, foreign.head_faces())
+    assert run("nerfstudio", source, tmp_path / "me", "--meshes", tmp_path / "meshes") == 0
+    assert_checks(tmp_path / "me")
+    capture = open_capture(tmp_path / "me")
+    ours = read_mesh(capture, "0002", read_topology(tmp_path / "me"))["head"] + capture.origin
+    np.testing.assert_allclose(ours, foreign.heads()[1][2] + far, rtol=0, atol=1e-6)
