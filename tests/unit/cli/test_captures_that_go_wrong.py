@@ -230,9 +230,9 @@ def assert_same(found, expected, atol):
     for part, one in expected[0].parts.items():
         other = sequence.parts[part]
         np.testing.assert_array_equal(other.faces, one.faces)
-        np.testing.assert_allclose(
-            other.verts - other.verts.mean((0, 1)), one.verts - one.verts.mean((0, 1)), rtol=0, atol=atol
-        )
+        verts = [mesh.verts.astype(np.float64) for mesh in (other, one)]
+        ours, theirs = (v - v.mean((0, 1)) for v in verts)
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=atol)
     for frame, layers in expected[1].items():
         for layer, picture in zip(layers, made[frame]):
             np.testing.assert_array_equal(layer, picture)
