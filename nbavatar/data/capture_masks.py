@@ -8,7 +8,7 @@ import numpy as np
 
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.capture import Capture, read_splits, read_topology
-from nbavatar.data.mask_values import LABELS, Meaning, ValueSurvey
+from nbavatar.data.mask_values import LABELS, Meaning, ValueSurvey, spread
 from nbavatar.data.pictures import find_picture
 from nbavatar.errors import DataError
 from nbavatar.io.pictures import read_plane
@@ -89,8 +89,8 @@ def _picture(root: Path, kind: str, camera: str, frame: str) -> Path:
 
 
 def _labelled_elsewhere(capture: Capture, camera: Camera) -> bool:
-    """Whether another camera's masks hold the labels of hands: this camera may just not see any."""
-    for frame in read_splits(capture.root).frames:
+    """Whether another camera's masks hold the labels of hands, in some of the frames: this one may just not see any."""
+    for frame in spread(read_splits(capture.root).frames):
         for other in capture.cameras.values():
             path = find_picture(capture.root / "masks" / other.name, frame)
             if other.name != camera.name and path is not None:

@@ -9,14 +9,14 @@ labels that a lossy format has blurred.
 """
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import cv2
 import numpy as np
 
 from nbavatar.errors import DataError
 
-__all__ = ["LABELS", "Meaning", "ValueSurvey"]
+__all__ = ["LABELS", "Meaning", "ValueSurvey", "spread"]
 
 LABELS = 3
 """Largest label."""
@@ -62,6 +62,11 @@ class Meaning:
             return values
         scaled = (values.astype(np.uint32) * 255 + self.white // 2) // self.white
         return np.minimum(scaled, 255).astype(np.uint8)
+
+
+def spread(names: Sequence[str], most: int = 256) -> list[str]:
+    """At most so many names, evenly spread: enough to see what kind of masks another camera has."""
+    return [names[i] for i in np.unique(np.linspace(0, len(names) - 1, min(most, len(names))).astype(int))]
 
 
 class ValueSurvey:

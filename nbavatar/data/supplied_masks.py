@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from nbavatar.camera.pinhole import Camera
-from nbavatar.data.mask_values import LABELS, Meaning, ValueSurvey
+from nbavatar.data.mask_values import LABELS, Meaning, ValueSurvey, spread
 from nbavatar.data.pictures import find_picture, list_pictures
 from nbavatar.errors import DataError
 from nbavatar.io.pictures import Plane, read_plane
@@ -87,10 +87,10 @@ def _from_video(path: Path, frames: Sequence[str], camera: Camera) -> Iterator[t
 
 
 def _labelled_beside(folder: Path) -> bool:
-    """Whether another camera's images hold the labels of hands: this camera may just not see any."""
+    """Whether another camera's images hold the labels of hands, in some frames: this one may just not see any."""
     for other in sorted(folder.parent.iterdir()):
         if other.is_dir() and other != folder:
-            for name in list_pictures(other):
+            for name in spread(list(list_pictures(other))):
                 path = find_picture(other, name)
                 if path is not None and 1 < int(read_plane(path).values.max(initial=0)) <= LABELS:
                     return True
