@@ -103,11 +103,22 @@ def parsing(
         raise
     except FileNotFoundError as cause:
         raise error.of(where, field, expected=expected, found="no such file") from cause
-    except OSError as cause:
-        found = f"one that cannot be read: {cause.strerror}" if cause.strerror else f"{damaged} ({_reason(cause)})"
-        raise error.of(where, field, expected=expected, found=found, fix=fix) from cause
     except Exception as cause:
-        raise error.of(where, field, expected=expected, found=f"{damaged} ({_reason(cause)})", fix=fix) from cause
+        found = f"{damaged} ({_reason(cause)})"
+        if isinstance(cause, OSError) and cause.strerror:
+            found = f"one that cannot be read: {cause.strerror}"
+        elif _is_pointer(where):
+            found, fix = "a pointer of Git LFS in its place", "fetch the file itself with: git lfs pull"
+        raise error.of(where, field, expected=expected, found=found, fix=fix) from cause
+
+
+def _is_pointer(where: object) -> bool:
+    """Whether a file is what Git leaves in place of a large one that was not fetched."""
+    try:
+        with open(str(where), "rb") as stream:
+            return stream.read(24) == b"version https://git-lfs."
+    except (OSError, ValueError):
+        return False
 
 
 def _reason(cause: Exception) -> str:

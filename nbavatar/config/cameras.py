@@ -10,7 +10,7 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from nbavatar.errors import ConfigError, DataError, describe, did_you_mean
+from nbavatar.errors import ConfigError, DataError, describe, did_you_mean, parsing
 from nbavatar.names import check_name
 
 __all__ = ["StoredCamera", "choose_camera", "parse_camera", "read_rig", "stored_test_camera"]
@@ -84,13 +84,8 @@ def read_rig(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises:
         DataError: missing, no JSON, no mapping of cameras, or a name that is there twice.
     """
-    try:
-        with open(path, encoding="utf-8-sig") as stream:
-            stored = json.load(stream, object_pairs_hook=_Pairs)
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="a JSON file", found="no such file") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError.of(path, expected="JSON", found=f"text that does not parse ({error})") from error
+    with parsing(path, "a JSON file", damaged="text that does not parse"), open(path, encoding="utf-8-sig") as stream:
+        stored = json.load(stream, object_pairs_hook=_Pairs)
     if not isinstance(stored, _Pairs) or not stored:
         found = "an empty mapping" if stored == [] and isinstance(stored, _Pairs) else type(stored).__name__
         raise DataError.of(path, expected="a mapping from camera name to its calibration", found=found)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from nbavatar.errors import DataError, require
+from nbavatar.errors import DataError, parsing, require
 from nbavatar.io.atomic import atomic_write, storage_errors
 
 __all__ = ["CODECS", "VideoInfo", "VideoWriter", "probe_video", "read_video"]
@@ -180,10 +180,10 @@ class _Capture:
         if not file.is_file():
             raise DataError.of(path, expected="a video file", found="no such file")
         self.handle: Any = cv2.VideoCapture(str(file))
-        if not self.handle.isOpened():
-            fix = "it is truncated, damaged or of an unknown codec: fetch it again"
-            found = f"one that does not open ({file.stat().st_size} bytes)"
-            raise DataError.of(path, expected="a readable video", found=found, fix=fix)
+        fix = "it is truncated, damaged or of an unknown codec: fetch it again"
+        with parsing(path, "a readable video", damaged="one that does not open", fix=fix):
+            if not self.handle.isOpened():
+                raise ValueError(f"{file.stat().st_size} bytes")
         get = self.handle.get
         self.info = VideoInfo(
             int(get(cv2.CAP_PROP_FRAME_WIDTH)),

@@ -17,6 +17,7 @@ from nbavatar.data.sequences import read_sequence
 from nbavatar.io.framepack import FramePack
 
 FRAMES = [f"t{i}" for i in range(5)]
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:%064d\nsize 9876\n" % 0
 
 
 def chain(capture, out, camera="left"):
@@ -191,9 +192,10 @@ LOUD = {
         "ingest", "found 80 x 96, turned by its EXIF orientation 6",
     ),
     "PostScript": (replaced("masks/left/t1.png", b"%!PS-Adobe-3.0 EPSF-3.0\n"), "ingest", "t1.png: expected a whole"),
-    "a pointer of Git LFS": (
-        replaced("images/left/t1.png", b"version https://git-lfs.github.com/spec/v1\n"), "ingest", "git lfs pull",
-    ),
+    "an image is a pointer": (replaced("images/left/t1.png", POINTER), "ingest", "t1.png: expected a whole image"),
+    "a mesh is a pointer": (replaced("meshes/t1.npz", POINTER), "tracks", "a pointer of Git LFS in its place; fetch"),
+    "cameras are a pointer": (replaced("cameras.json", POINTER), "tracks", "a pointer of Git LFS in its place; fetch"),
+    "splits are a pointer": (replaced("splits.json", POINTER), "tracks", "a pointer of Git LFS in its place; fetch"),
     "a damaged image": (replaced("images/left/t1.png", b"\x89PNG\r\n\x1a\n" + bytes(99)), "ingest", "does not decode"),
     "lens under another key": (cameras(lambda e: e.update(distCoef=[0.1, 0, 0, 0])), "tracks", "mean distortion?"),
     "fisheye": (cameras(lambda e: e.update(camera_model="OPENCV_FISHEYE")), "tracks", "found 'OPENCV_FISHEYE'"),

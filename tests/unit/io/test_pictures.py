@@ -101,7 +101,10 @@ def test_formats_that_change_values_are_known(tmp_path, name, lossy, options):
     ("content", "found"),
     [
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 6\nshowpage\n", "PostScript"),
-        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "a Git LFS pointer; .* git lfs pull"),
+        (
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n",
+            "a pointer of Git LFS in its place; .* git lfs pull",
+        ),
         (b"", "an empty file"),
         (b"<html>404</html>", "text"),
         (b"II*\x00 and so on", "a TIFF; convert it to png"),
