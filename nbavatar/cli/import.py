@@ -3,7 +3,8 @@
   nbavatar import vhap SRC OUT --flame generic_model.pkl    VHAP's export (GaussianAvatars): FLAME parameters or OBJ
   nbavatar import nerfstudio SRC OUT --scale M              transforms.json of nerfstudio or instant-ngp
   nbavatar import colmap SRC OUT --scale M                  cameras and images of COLMAP, text or binary
-  nbavatar import meshes SRC OUT                            OBJ or PLY files into OUT, a capture without meshes
+  nbavatar import meshes SRC OUT                            OBJ or PLY files, or the meshes.npz of `nbavatar fit`, into
+                                                            OUT, a capture without meshes
 
 Writes OUT, which must not exist yet: cameras.json, images/, masks/, meshes/, splits.json (see README.md) and
 import.json, which says where all came from. Pictures become links to SRC unless --copy is given. Cameras are brought to
@@ -26,7 +27,7 @@ from nbavatar.cli.common import progress
 from nbavatar.data.capture import read_splits
 from nbavatar.data.foreign.capture_folder import write_capture, write_meshes
 from nbavatar.data.foreign.colmap import read_colmap
-from nbavatar.data.foreign.mesh_files import JoinedMeshes, find_mesh_files
+from nbavatar.data.foreign.mesh_files import JoinedMeshes, open_meshes
 from nbavatar.data.foreign.nerfstudio import read_nerfstudio
 from nbavatar.data.foreign.recordings import with_recordings
 from nbavatar.data.foreign.source import Source
@@ -46,7 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--names", default="", metavar="TEXT", help="nerfstudio, colmap: camera and frame in paths")
     parser.add_argument("--images", metavar="DIR", help="nerfstudio, colmap: recordings, DIR/CAMERA/FRAME.jpg")
     parser.add_argument("--masks", metavar="DIR", help="masks to take, DIR/CAMERA/FRAME.png")
-    parser.add_argument("--meshes", metavar="DIR", help="meshes to take (OBJ or PLY)")
+    parser.add_argument(
+        "--meshes", metavar="PATH", help="meshes to take: a folder of OBJ or PLY, or a mesh sequence (.npz)"
+    )
     parser.add_argument("--scale", type=_positive, default=1.0, metavar="M", help="metres per unit of SRC (default 1)")
     parser.add_argument(
         "--mesh-scale", type=_positive, metavar="M", help="metres per unit of the mesh files (default: --scale)"
@@ -68,7 +71,7 @@ def main(args: argparse.Namespace) -> None:
     mesh_scale = args.scale if args.mesh_scale is None else args.mesh_scale
     _refuse_idle(args)
     if args.format == "meshes":
-        files = find_mesh_files(root, scale=mesh_scale, repair=args.repair)
+        files = open_meshes(root, scale=mesh_scale, repair=args.repair)
         frames = {frame: frame for frame in read_splits(out).frames}
         write_meshes(files, out, frames, progress=progress)
         _say(files.notes, f"{out / 'meshes'}: {len(frames)} frames of {', '.join(files.topology())}")
@@ -77,7 +80,7 @@ def main(args: argparse.Namespace) -> None:
     if args.images or args.masks:
         source = with_recordings(source, _folder(args.images), _folder(args.masks))
     if args.meshes:
-        files = find_mesh_files(Path(args.meshes), scale=mesh_scale, repair=args.repair)
+        files = open_meshes(Path(args.meshes), scale=mesh_scale, repair=args.repair)
         source.notes.extend(files.notes)
         source.meshes = files if source.meshes is None else JoinedMeshes([source.meshes, files])
     options = {key: value for key, value in vars(args).items() if key not in ("source", "out")}

@@ -15,7 +15,7 @@ __all__ = ["PersonMatting"]
 _SIDE = 256
 _OUTPUT = "activation_10"
 _MARGIN = 0.15  # around the person's box, as a share of its longer side
-_STEEP = (0.25, 0.75)  # what the network is surer of than that is background or person outright
+_STEEP = (0.25, 0.75)  # along its edge the matte rises between these
 
 
 class PersonMatting:
@@ -43,8 +43,7 @@ class PersonMatting:
                 sure[y0:y1, x0:x1] = near
             radius = max(2, round(max(sure.shape) / _SIDE * 2))
             sure = _fit_edges(image, sure, radius)
-        low, high = _STEEP
-        return np.round(np.clip((sure - low) / (high - low), 0.0, 1.0) * 255).astype(np.uint8)
+        return _decided(sure, max(2, round(max(sure.shape) / _SIDE)))
 
     def _look(self, image: np.ndarray) -> np.ndarray:
         """How sure the network is of each pixel, float32 `[H, W]` in [0, 1]."""
@@ -54,6 +53,16 @@ class PersonMatting:
         self._network.show(shown, 0.0)
         found = self._network.output(_OUTPUT).reshape(_SIDE, _SIDE)
         return np.clip(cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR), 0.0, 1.0)
+
+
+def _decided(sure: np.ndarray, rim: int) -> np.ndarray:
+    """A matte that is soft along its edge only: what the network is unsure of elsewhere falls to the likelier side."""
+    person = (sure > 0.5).astype(np.uint8)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1, 2 * rim + 1))
+    edge = cv2.dilate(person, kernel) > cv2.erode(person, kernel)
+    low, high = _STEEP
+    soft = np.clip((sure - low) / (high - low), 0.0, 1.0)
+    return np.round(np.where(edge, soft, person) * 255).astype(np.uint8)
 
 
 def _box(inside: np.ndarray, margin: float) -> tuple[int, int, int, int]:

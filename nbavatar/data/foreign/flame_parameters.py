@@ -63,13 +63,13 @@ class FlameSequence:
     def _read(self, path: Path) -> dict[str, np.ndarray]:
         """Parameters, float64, flat but for the offsets `[V, 3]` of FLAME's own vertices."""
         arrays, _ = read_arrays(path, required=tuple(_WIDTHS))
-        result = {}
+        result: dict[str, np.ndarray] = {}
         for key, width in _WIDTHS.items():
             value = arrays[key]
             if value.dtype.kind not in "fiu" or value.shape not in ((width,), (1, width)):
                 expected = f"numbers [1, {width}]"
                 raise DataError.of(path, key, expected=expected, found=f"{value.dtype} {list(value.shape)}")
-            result[key] = value.astype(np.float64).reshape(width)
+            result[key] = _double(value).reshape(width)
         count = len(self._arrays.template)
         for key in _OFFSETS:
             if key not in arrays:
@@ -79,7 +79,7 @@ class FlameSequence:
             if value.dtype.kind not in "fiu" or value.shape not in shapes:
                 expected = f"numbers [1, {count}, 3] as FLAME has vertices, or [1, {count + _TEETH}, 3] with teeth"
                 raise DataError.of(path, key, expected=expected, found=f"{value.dtype} {list(value.shape)}")
-            result[key] = value.astype(np.float64).reshape(-1, 3)[:count]
+            result[key] = _double(value).reshape(-1, 3)[:count]
         for key, value in result.items():
             if not np.isfinite(value).all():
                 raise DataError.of(path, key, expected="finite numbers", found="NaN or infinity")
@@ -101,3 +101,9 @@ class FlameSequence:
             eyes=given["eyes_pose"],
         )  # fmt: skip
         return (posed.verts[0] + given["translation"][0]).numpy()
+
+
+def _double(value: np.ndarray) -> np.ndarray:
+    """The numbers in double precision; what is no number stays none, without a warning."""
+    with np.errstate(invalid="ignore"):
+        return value.astype(np.float64)

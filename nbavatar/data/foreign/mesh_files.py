@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from nbavatar.data.foreign.source import Meshes, natural
-from nbavatar.data.sequences import PARTS
+from nbavatar.data.sequences import PARTS, read_sequence
 from nbavatar.errors import DataError
 from nbavatar.io.meshfiles import MESH_TYPES, read_mesh_file
 from nbavatar.mesh.repair import repair_faces
 
-__all__ = ["JoinedMeshes", "MeshFiles", "find_mesh_files"]
+__all__ = ["JoinedMeshes", "MeshFiles", "SequenceMeshes", "find_mesh_files", "open_meshes"]
 
 _REST = "rest"
 
@@ -97,6 +97,32 @@ class JoinedMeshes:
     def vertices(self, frame: str) -> Mapping[str, np.ndarray]:
         """See `Meshes`."""
         return {part: verts for source in self._sources for part, verts in source.vertices(frame).items()}
+
+
+class SequenceMeshes:
+    """The meshes of a mesh sequence (`nbavatar.data.sequences`), such as `nbavatar fit` writes; metres."""
+
+    def __init__(self, path: Path) -> None:
+        self._sequence, _ = read_sequence(path)
+        self._rows = {frame: row for row, frame in enumerate(self._sequence.frames)}
+        self.notes: list[str] = []
+
+    def topology(self) -> Mapping[str, tuple[np.ndarray, np.ndarray | None]]:
+        """See `Meshes`."""
+        return {name: (part.faces, part.rest) for name, part in self._sequence.parts.items()}
+
+    def vertices(self, frame: str) -> Mapping[str, np.ndarray]:
+        """See `Meshes`; a part whose vertices are NaN is not in the frame."""
+        row = self._rows.get(frame)
+        if row is None:
+            return {}
+        verts = {name: part.verts[row].astype(np.float64) for name, part in self._sequence.parts.items()}
+        return {name: values for name, values in verts.items() if np.isfinite(values).all()}
+
+
+def open_meshes(path: Path, *, scale: float = 1.0, repair: bool = False) -> MeshFiles | SequenceMeshes:
+    """The meshes of a folder of files (`find_mesh_files`), or of a mesh sequence (.npz), which is in metres already."""
+    return SequenceMeshes(path) if path.is_file() else find_mesh_files(path, scale=scale, repair=repair)
 
 
 def find_mesh_files(folder: Path, *, scale: float = 1.0, repair: bool = False) -> MeshFiles:

@@ -464,3 +464,21 @@ def test_worlds_far_from_their_origin_keep_their_millimetres(tmp_path):
     capture = open_capture(tmp_path / "me")
     ours = read_mesh(capture, "0002", read_topology(tmp_path / "me"))["head"] + capture.origin
     np.testing.assert_allclose(ours, foreign.heads()[1][2] + far, rtol=0, atol=1e-6)
+
+
+def test_a_mesh_sequence_goes_into_a_capture(capture, tmp_path):
+    """What `nbavatar fit` and `tracks` write, back into the files of a capture."""
+    words = ["--layout", "capture", "--root", str(capture), "--subject", "me", "--cfg", '{"contact": "given"}']
+    assert main(["tracks", *words, "--out", str(tmp_path / "meshes.npz")]) == 0
+    before = {path.name: dict(np.load(path)) for path in (capture / "meshes").glob("t*[0-9].npz")}
+    faces = dict(np.load(capture / "meshes/topology.npz"))
+    (capture / "meshes").rename(tmp_path / "old")
+    assert run("meshes", tmp_path / "meshes.npz", capture) == 0
+    after = {path.name: dict(np.load(path)) for path in (capture / "meshes").glob("t*[0-9].npz")}
+    assert len(after) == len(before) == 5
+    for name, arrays in after.items():
+        for part in ("head", "right_hand"):
+            np.testing.assert_array_equal(arrays[part], before[name][part])
+    topology = dict(np.load(capture / "meshes/topology.npz"))
+    np.testing.assert_array_equal(topology["right_hand_faces"], faces["right_hand_faces"])
+    assert not check_capture(capture).defects

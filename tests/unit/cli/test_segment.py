@@ -5,6 +5,7 @@ import os
 import zipfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -142,6 +143,24 @@ def test_a_person_is_told_from_the_background(bare):
     survey = ValueSurvey()
     survey.add(matte, False, "matte")
     assert survey.masks("masks", ["head", "right_hand"]).kind == "person", "what the other stages take for a matte"
+
+
+def test_what_the_network_is_unsure_of_becomes_one_or_the_other():
+    """A vague shoulder in a dark corner is no matte to the other stages: those are soft at their edges only."""
+    from nbavatar.detection.matting import _decided
+
+    y, x = np.mgrid[0:120, 0:160]
+    sure = np.clip(1.2 - np.hypot(x - 60, y - 50) / 40, 0, 1).astype(np.float32)
+    sure = np.maximum(sure, np.where((x > 90) & (y > 80), 0.4 + 0.15 * (x > 120), 0))
+    matte = _decided(sure, 2)
+    assert matte[110, 100] == 0 and matte[110, 150] == 255 and matte[50, 60] == 255
+    survey = ValueSurvey()
+    survey.add(matte, False, "matte")
+    assert survey.masks("masks", ["head", "right_hand"]).kind == "person"
+    person = (sure > 0.5).astype(np.uint8)
+    away = np.maximum(*(cv2.distanceTransform(side, cv2.DIST_L2, 5) for side in (person, 1 - person)))
+    soft = (matte > 0) & (matte < 255)
+    assert soft.any() and away[soft].max() < 4
 
 
 @needs_wheel
