@@ -67,7 +67,7 @@ _VERSIONS = ("numpy", "torch", "numba", "scipy", "opencv-contrib-python-headless
 # the machine's GPUs and folders are.
 _NEUTRAL = {
     *("nbavatar", "nbavatar.cli", "nbavatar.cli.common", "nbavatar.errors", "nbavatar.packages", "nbavatar.provenance"),
-    *("nbavatar.devices", "nbavatar.gpus", "nbavatar.private"),
+    *("nbavatar.devices", "nbavatar.gpus", "nbavatar.private", "nbavatar.processes"),
 }
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 

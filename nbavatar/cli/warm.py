@@ -6,7 +6,8 @@ Importing torch and loading the compiled kernels takes seconds, which is nothing
 run of dozens of tiny jobs. This process loads them once, while COMMAND is already running. `nbavatar train`, `render`,
 `evaluate` and the like below COMMAND then hand their arguments, folder, environment and open streams to it over a
 socket, and it forks a process that runs them: one process a job, as ever, with nothing shared but what was loaded.
-A job whose caller disappears is terminated. Linux and macOS, without a GPU (CUDA does not survive a fork).
+A job whose caller disappears is terminated, and so is all that was started here when COMMAND ends or this process does,
+however it ends. Where no socket can be made COMMAND runs without. Linux and macOS, without a GPU (CUDA does not survive a fork).
 
 Snakemake's `benchmark:` files then see the waiting caller; their wall times are right, their processor times and
 memory are not.
@@ -14,24 +15,33 @@ memory are not.
 
 import argparse
 import contextlib
+import ctypes
 import json
 import os
+import re
 import selectors
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
 from nbavatar.cli import SOCKET_VARIABLE
+from nbavatar.cli.supervision import leave_guard, supervised, wait
 from nbavatar.errors import ConfigError
+from nbavatar.processes import alive, machine
 
 __all__ = ["add_arguments", "call", "main"]
 
 _LONGEST = 1 << 20  # bytes of a request: arguments and environment
+_GRACE_S = 5.0  # for a job to save its state
+_SOCKET = "socket"
+_PR_SET_PDEATHSIG = 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +54,7 @@ def call(argv: Sequence[str]) -> int:
     request = json.dumps({"argv": list(argv), "folder": os.getcwd(), "environment": dict(os.environ)}).encode()
     with socket.socket(socket.AF_UNIX) as connection:
         answer = b""
-        with contextlib.suppress(ConnectionError):
+        with contextlib.suppress(ConnectionError, FileNotFoundError):
             connection.connect(os.environ[SOCKET_VARIABLE])
             socket.send_fds(connection, [len(request).to_bytes(8, "big")], [0, 1, 2])
             connection.sendall(request)
@@ -57,23 +67,44 @@ def call(argv: Sequence[str]) -> int:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Runs `nbavatar warm`; its exit code is the command's."""
+    """Runs `nbavatar warm`; its exit code is the command's, or 143 when it was told to terminate."""
     command = args.command[1:] if args.command[:1] == ["--"] else args.command
     if not command:
         raise ConfigError("nbavatar warm: expected a command after `--`, found none")
-    with tempfile.TemporaryDirectory(prefix="nbavatar-") as folder:
-        path = str(Path(folder) / "socket")
-        with socket.socket(socket.AF_UNIX) as listener:
-            listener.bind(path)
-            listener.listen(64)
-            process = subprocess.Popen(command, env={**os.environ, SOCKET_VARIABLE: path})
-            try:
-                _load()
-                return _Server(listener).serve(process)
-            finally:
-                if process.poll() is None:
-                    process.terminate()
-                    process.wait()
+    with contextlib.ExitStack() as stack:
+        listener = stack.enter_context(socket.socket(socket.AF_UNIX))
+        folder = _bound(listener)
+        if folder is None:
+            print("nbavatar warm: no folder for a socket, jobs start at their usual pace; set TMPDIR to a short path",
+                  file=sys.stderr)  # fmt: skip
+            return wait(stack.enter_context(supervised(command, os.environ)))
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        listener.listen(64)
+        environment = {**os.environ, SOCKET_VARIABLE: str(folder / _SOCKET)}
+        process = stack.enter_context(supervised(command, environment))
+        _load()
+        return _Server(listener).serve(process)
+
+
+def _bound(listener: socket.socket) -> Path | None:
+    """Binds the socket in a new folder of this user's own; the folder, or None where there is room for none."""
+    form = re.compile(rf"nbavatar-warm-{machine()}-(\d+)-\w+")
+    places = [os.environ.get("TMPDIR"), os.environ.get("XDG_RUNTIME_DIR"), "/tmp", "/var/tmp", "/dev/shm"]
+    for place in filter(None, places):
+        folder = ""
+        with contextlib.suppress(OSError):
+            for name in os.listdir(place):  # of servers that were killed
+                match = form.fullmatch(name)
+                if match and not alive(int(match[1])) and os.lstat(Path(place, name)).st_uid == os.geteuid():
+                    shutil.rmtree(Path(place, name), ignore_errors=True)
+        # A path that is too long for a socket is refused by Python, in a form of OSError without a number.
+        with contextlib.suppress(OSError):
+            folder = tempfile.mkdtemp(prefix=f"nbavatar-warm-{machine()}-{os.getpid()}-", dir=place)
+            listener.bind(str(Path(folder) / _SOCKET))
+            return Path(folder)
+        if folder:
+            shutil.rmtree(folder, ignore_errors=True)
+    return None
 
 
 def _load() -> None:
@@ -112,21 +143,33 @@ class _Server:
         signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
         self._selector.register(self._woken, selectors.EVENT_READ)
 
-    def serve(self, process: subprocess.Popen[bytes]) -> int:
+    def serve(self, process: "subprocess.Popen[bytes]") -> int:
         """Serves until the command ends; returns its exit code."""
-        while process.poll() is None:
-            self._reap()
-            for key, _ in self._selector.select(timeout=1.0):
-                if key.fileobj is self._listener:
-                    self._start(self._listener.accept()[0])
-                elif key.fileobj == self._woken:
-                    with contextlib.suppress(BlockingIOError):
-                        os.read(self._woken, 4096)
-                else:
-                    self._abandon(key.fileobj)
-        for pid in self._jobs:
-            os.kill(pid, signal.SIGTERM)
+        interrupted = False
+        try:
+            while process.poll() is None:
+                try:
+                    self._turn()
+                except KeyboardInterrupt:  # the command has it from the keyboard too, and ends in its own way
+                    if interrupted:
+                        raise
+                    interrupted = True
+        finally:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            self._end_jobs()
         return process.returncode if process.returncode >= 0 else 128 - process.returncode
+
+    def _turn(self) -> None:
+        self._reap()
+        for key, _ in self._selector.select(timeout=1.0):
+            if key.fileobj is self._listener:
+                with contextlib.suppress(OSError):  # a caller that was gone before it was met
+                    self._start(self._listener.accept()[0])
+            elif key.fileobj == self._woken:
+                with contextlib.suppress(BlockingIOError):
+                    os.read(self._woken, 4096)
+            elif isinstance(key.fileobj, socket.socket):
+                self._look_at(key.fileobj)
 
     def _reap(self) -> None:
         for pid in list(self._jobs):
@@ -135,43 +178,81 @@ class _Server:
                 continue
             caller = self._jobs.pop(pid)
             code = os.waitstatus_to_exitcode(status)
-            with contextlib.suppress(OSError, KeyError):
+            with contextlib.suppress(OSError, KeyError, ValueError):
                 self._selector.unregister(caller)
             with contextlib.suppress(OSError):
                 caller.sendall(bytes([code if code >= 0 else 128 - code]))
             caller.close()
 
-    def _abandon(self, caller: object) -> None:
-        """The caller is gone: its job ends too."""
+    def _look_at(self, caller: socket.socket) -> None:
+        """If a caller is gone its job ends too; if it still speaks, its job is about to listen."""
+        try:
+            gone = not caller.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return
+        except OSError:
+            gone = True
+        if not gone:
+            time.sleep(0.001)
+            return
+        self._selector.unregister(caller)
         for pid, other in self._jobs.items():
             if other is caller:
-                self._selector.unregister(other)
                 os.kill(pid, signal.SIGTERM)
 
     def _start(self, caller: socket.socket) -> None:
-        header, streams, _, _ = socket.recv_fds(caller, 8, 3)
-        size = int.from_bytes(header, "big")
-        if len(header) != 8 or len(streams) != 3 or size > _LONGEST:
-            caller.close()
-            return
-        with caller.makefile("rb") as stream:
-            request = json.loads(stream.read(size))
+        # The request is read by the job, so that a caller that stalls keeps nobody but itself waiting.
         pid = os.fork()
         if pid == 0:
-            os._exit(_run(request, streams))
-        for stream in streams:
-            os.close(stream)
+            status = 1
+            try:
+                self._forget()
+                status = _run(caller)
+            finally:
+                os._exit(status)
         self._jobs[pid] = caller
         self._selector.register(caller, selectors.EVENT_READ)
 
+    def _forget(self) -> None:
+        """In a job: closes what is the server's, so that nobody takes the job for it."""
+        leave_guard()
+        # A job that was forked has no environment of its own by which a guard would find it. Linux only.
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        signal.set_wakeup_fd(-1)
+        for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_DFL if number != signal.SIGINT else signal.default_int_handler)
+        self._selector.close()
+        self._listener.close()
+        for stream in (self._woken, self._wake):
+            os.close(stream)
+        for other in self._jobs.values():
+            other.close()
 
-def _run(request: dict, streams: Sequence[int]) -> int:
+    def _end_jobs(self) -> None:
+        for number, patience in ((signal.SIGTERM, _GRACE_S), (signal.SIGKILL, _GRACE_S)):
+            for pid in self._jobs:
+                os.kill(pid, number)
+            until = time.monotonic() + patience
+            while self._jobs and time.monotonic() < until:
+                self._reap()
+                time.sleep(0.02)
+
+
+def _run(caller: socket.socket) -> int:
     """A forked process becomes the caller's: its streams, folder and environment, then its verb."""
-    signal.set_wakeup_fd(-1)
-    for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, signal.SIG_DFL if number != signal.SIGINT else signal.default_int_handler)
-    for target, stream in enumerate(streams):
-        os.dup2(stream, target)
+    header, streams, _, _ = socket.recv_fds(caller, 8, 3)
+    size = int.from_bytes(header, "big")
+    if len(header) != 8 or len(streams) != 3 or size > _LONGEST:
+        return 1
+    with caller.makefile("rb") as stream:
+        content = stream.read(size)
+    if len(content) < size:  # the caller is gone
+        return 1
+    caller.close()
+    request = json.loads(content)
+    for target, descriptor in enumerate(streams):
+        os.dup2(descriptor, target)
     os.environ.clear()
     os.environ.update(request["environment"])
     del os.environ[SOCKET_VARIABLE]

@@ -8,10 +8,10 @@ import re
 import secrets
 import time
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 from nbavatar.errors import NBAvatarError, StorageError
+from nbavatar.processes import alive, machine
 
 __all__ = ["atomic_write", "storage_errors", "temporary_beside"]
 
@@ -57,7 +57,7 @@ def temporary_beside(path: str | os.PathLike[str]) -> Path:
     if len(os.fsencode(target.name)) > _LONG_NAME:  # file systems end names at 255 bytes, and ours is longer
         stem, suffix = hashlib.sha256(stem.encode()).hexdigest()[:32], suffix[-_LONG_NAME // 2 :]
     _sweep(target.parent, stem, suffix)
-    return target.with_name(f".{stem}.{_host()}-{os.getpid()}.{secrets.token_hex(4)}.tmp{suffix}")
+    return target.with_name(f".{stem}.{machine()}-{os.getpid()}.{secrets.token_hex(4)}.tmp{suffix}")
 
 
 @contextlib.contextmanager
@@ -112,26 +112,7 @@ def _sweep(folder: Path, stem: str, suffix: str) -> None:
             match = form.fullmatch(entry.name)
             if match is None:
                 continue
-            gone = match["host"] == _host() and not _alive(int(match["process"]))
+            gone = match["host"] == machine() and not alive(int(match["process"]))
             with contextlib.suppress(OSError):
                 if gone or time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED_S:
                     os.unlink(entry.path)
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # somebody else's
-        return True
-    return True
-
-
-@cache
-def _host() -> str:
-    """Tells apart machines, and containers on them, that write to one network disk: process numbers are theirs."""
-    space = ""
-    with contextlib.suppress(OSError):  # no /proc
-        space = os.readlink("/proc/self/ns/pid")
-    return hashlib.sha256(f"{os.uname().nodename} {space}".encode()).hexdigest()[:6]

@@ -1,8 +1,14 @@
 """`nbavatar warm`: forked jobs behave as processes of their own do, for their callers and for the system."""
 
 import json
+import os
 import subprocess
 import sys
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
 
 # The command that runs under the server; one for all checks, because starting the server loads torch.
 _SCRIPT = """
@@ -75,3 +81,102 @@ def test_without_a_command_is_a_clear_line(capsys):
 
     assert main(["warm"]) == 2
     assert "expected a command after `--`" in capsys.readouterr().err
+
+
+# Callers that behave badly, beside one that behaves well.
+_BAD = """
+import os, socket, subprocess, sys, time
+run = [sys.executable, "-m", "nbavatar"]
+silent, half = socket.socket(socket.AF_UNIX), socket.socket(socket.AF_UNIX)
+for caller in (silent, half):
+    caller.connect(os.environ["NBAVATAR_WARM"])
+socket.send_fds(half, [(1000).to_bytes(8, "big")], [0, 1, 2])
+half.sendall(b"{")
+for number in range(3):  # gone before they said anything, or in the middle
+    with socket.socket(socket.AF_UNIX) as lost:
+        lost.connect(os.environ["NBAVATAR_WARM"])
+        if number:
+            socket.send_fds(lost, [(1000).to_bytes(8, "big")], [0, 1, 2])
+            lost.sendall(b"{" * number)
+sys.exit(subprocess.run([*run, "speed", "--help"], stdout=subprocess.DEVNULL, timeout=120).returncode)
+"""
+
+
+def test_callers_that_stall_or_die_stop_nobody_else(tmp_path):
+    (tmp_path / "command.py").write_text(_BAD)
+    command = [sys.executable, "-m", "nbavatar", "warm", "--", sys.executable, str(tmp_path / "command.py")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+# A job that lasts for ever, below a shell as Snakemake's are, and a program of the command's own.
+_LASTING = """
+import os, subprocess, sys
+folder = sys.argv[1]
+os.mkfifo(f"{folder}/model.pt")
+verb = [sys.executable, "-m", "nbavatar", "render", "--model", f"{folder}/model.pt", "--meshes", "a.npz", "--frames",
+        "a.zip", "--out", "out.zip"]
+subprocess.Popen(["bash", "-c", '"$@"; true', "job", *verb])
+subprocess.Popen(["sleep", "1000"])
+subprocess.Popen(["sleep", "1000"]).wait()
+"""
+
+
+def _lasting(tmp_path, environment=None):
+    (tmp_path / "command.py").write_text(_LASTING)
+    command = [
+        sys.executable,
+        "-m",
+        "nbavatar",
+        "warm",
+        "--",
+        sys.executable,
+        str(tmp_path / "command.py"),
+        str(tmp_path),
+    ]
+    server = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
+    until = time.monotonic() + 120.0
+    family: list[psutil.Process] = []
+    while len(family) < 7:  # guard, command, shell, caller, job, two programs
+        assert server.poll() is None and time.monotonic() < until, family
+        time.sleep(0.05)
+        family = psutil.Process(server.pid).children(recursive=True)
+    return server, family
+
+
+def test_told_to_terminate_it_ends_what_it_started(tmp_path):
+    server, family = _lasting(tmp_path)
+    server.terminate()
+    assert server.wait(60) == 143
+    assert psutil.wait_procs(family, timeout=60)[1] == []
+
+
+def test_killed_it_leaves_no_process_and_the_next_removes_its_folder(tmp_path):
+    place = Path(tempfile.mkdtemp(prefix="nbavatar-test-", dir="/tmp"))  # pytest's folders are too long for a socket
+    environment = os.environ | {"TMPDIR": str(place)}
+    server, family = _lasting(tmp_path, environment)
+    server.kill()
+    server.wait()
+    assert psutil.wait_procs(family, timeout=60)[1] == []
+    assert [path.name.startswith("nbavatar-warm-") for path in place.iterdir()] == [True]
+    done = subprocess.run([sys.executable, "-m", "nbavatar", "warm", "--", "true"], env=environment)
+    assert done.returncode == 0
+    assert list(place.iterdir()) == []
+    place.rmdir()
+
+
+def test_without_a_folder_for_a_socket_jobs_still_run(tmp_path, monkeypatch, capsys):
+    """Where TMPDIR is too long for a socket another folder is taken; where there is none, there is no server."""
+    long = tmp_path / ("x" * 120)
+    long.mkdir()
+    code = "import os; raise SystemExit(3 if 'NBAVATAR_WARM' in os.environ else 4)"
+    command = [sys.executable, "-m", "nbavatar", "warm", "--", sys.executable, "-c", code]
+    assert subprocess.run(command, env=os.environ | {"TMPDIR": str(long)}).returncode == 3
+    assert list(long.iterdir()) == []
+    nowhere = (
+        f"import tempfile, sys; tempfile.mkdtemp = lambda **_: (_ for _ in ()).throw(OSError()); "
+        f"from nbavatar.cli import main; sys.exit(main(['warm', '--', sys.executable, '-c', {code!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", nowhere], capture_output=True, text=True)
+    assert done.returncode == 4
+    assert "no folder for a socket" in done.stderr and done.stderr.count("\n") == 1
