@@ -8,20 +8,20 @@ The first call copies the configuration files (`config/`) and the page that says
 (`resources/README.md`) into this folder, where you can edit them; files that are there already are left as they are.
 Results go to `results/<run>/`, logs to `logs/<run>/`. The same command again does only what is not done yet. What
 follows `--` goes to snakemake: `-- -n` shows what would run, `-- subject_S2` makes one subject, `-- --configfile FILE`
-takes other options. Needs the packages of the extra `pipeline`.
+takes other options. What a run that was killed has left, processes and Snakemake's lock, is cleared away first. Needs
+the packages of the extra `pipeline`.
 """
 
 import argparse
-import contextlib
 import importlib.util
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
 
+from nbavatar.cli.supervision import run_workflow, wait
 from nbavatar.errors import DataError, DependencyError
 from nbavatar.packages import install_line
 
@@ -57,10 +57,11 @@ def main(args: argparse.Namespace) -> int:
         print(f"{path}: written, yours to edit")
     if args.what == "paper":
         check = [*_OURSELVES, "check", "--layout", "decaf", "resources/DecafDataset"]
-        code = _call(check)
+        code = wait(subprocess.Popen(check))
         if code:
             return code
-    code = _call(_command(args, source))
+    # The jobs of the smoke run take a second or two each: the profile and `nbavatar warm` are for such.
+    code = run_workflow(_snakemake(args, source), warm=args.what == "smoke")
     report = here / "results" / args.what / "report" / "index.html"
     if code == 0 and report.is_file() and not args.snakemake:
         if args.what == "smoke":
@@ -70,26 +71,11 @@ def main(args: argparse.Namespace) -> int:
     return code
 
 
-def _call(words: list[str]) -> int:
-    """Runs a command to its end; its exit code.
-
-    An interrupt from the keyboard reaches it too: it is left to end in its own way, since Snakemake then removes its
-    lock of the folder. A request to terminate is passed on.
-    """
-    with subprocess.Popen(words) as process:
-        signal.signal(signal.SIGTERM, lambda *_: process.terminate())
-        while True:
-            with contextlib.suppress(KeyboardInterrupt):
-                code = process.wait()
-                return code if code >= 0 else 128 - code
-
-
-def _command(args: argparse.Namespace, source: Path) -> list[str]:
+def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:
     cores = str(args.cores or os.cpu_count() or 2)
     words = [sys.executable, "-m", "snakemake", "--snakefile", str(source / "Snakefile"), "--cores", cores]
     if args.what == "smoke":
-        # Its jobs take a second or two each: the profile and `nbavatar warm` are for such.
-        words = [*_OURSELVES, "warm", "--", *words, "--workflow-profile", str(source / "profiles" / "ci")]
+        words += ["--workflow-profile", str(source / "profiles" / "ci")]
     words += args.snakemake
     if "--configfile" not in args.snakemake:
         words += ["--configfile", f"config/{args.what}.yaml"]

@@ -7,7 +7,8 @@ run of dozens of tiny jobs. This process loads them once, while COMMAND is alrea
 `evaluate` and the like below COMMAND then hand their arguments, folder, environment and open streams to it over a
 socket, and it forks a process that runs them: one process a job, as ever, with nothing shared but what was loaded.
 A job whose caller disappears is terminated, and so is all that was started here when COMMAND ends or this process does,
-however it ends. Where no socket can be made COMMAND runs without. Linux and macOS, without a GPU (CUDA does not survive a fork).
+however it ends. Where no socket can be made COMMAND runs without it. Linux and macOS, without a GPU (CUDA does not
+survive a fork).
 
 Snakemake's `benchmark:` files then see the waiting caller; their wall times are right, their processor times and
 memory are not.

@@ -49,7 +49,6 @@ UNDECLARED = {
     "tokenizers": "comes with transformers; tests only",
     "smplx": "its licence keeps it out; an oracle of tests where somebody has it",
     "jsonschema": "comes with snakemake; tests only",
-    "psutil": "comes with snakemake; tests only",
     "packaging": "comes with pytest; tests only",
     "llvmlite": "comes with numba, of the version that numba needs",
     "setuptools": "builds the package",

@@ -19,11 +19,11 @@ def calls(monkeypatch):
     """Commands that would run; each ends well."""
     seen: list[list[str]] = []
 
-    def call(words):
-        seen.append(list(words))
+    def call(words, *, warm):
+        seen.append([*(["warm"] if warm else []), *words])
         return 0
 
-    monkeypatch.setattr(run, "_call", call)
+    monkeypatch.setattr(run, "run_workflow", call)
     return seen
 
 
@@ -47,7 +47,7 @@ def test_smoke_is_warm_and_takes_its_profile(calls, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["run", "smoke", "--cores", "2", "--", "-n"]) == 0
     ((*head, flag, value),) = calls
-    assert head[:5] == [sys.executable, "-m", "nbavatar", "warm", "--"]
+    assert head[:4] == ["warm", sys.executable, "-m", "snakemake"]
     assert str(ROOT / "Snakefile") in head and head[head.index("--cores") + 1] == "2" and "-n" in head
     assert (flag, value) == ("--configfile", "config/smoke.yaml")
     assert (tmp_path / "config" / "smoke.yaml").is_file()
@@ -97,7 +97,7 @@ def test_an_interrupt_leaves_the_command_time_to_end(tmp_path):
         "signal.signal(signal.SIGINT, end)\n"
         "pathlib.Path('ready').touch(); time.sleep(60)\n"
     )
-    call = f"sys.exit(run._call([sys.executable, '-c', {child!r}]))"
+    call = f"sys.exit(run.run_workflow([sys.executable, '-c', {child!r}]))"
     code = f"import sys; from nbavatar.cli import run; {call}"
     process = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, start_new_session=True)
     for _ in range(300):
