@@ -46,6 +46,13 @@ __all__ = [
 _FAR = 10_000.0  # [m]
 _COARSE = 2e-4  # [m]
 _SPLITS = ("frames", "train", "test", "cuts", "test_camera", "contact")
+_LIKE_SPLITS = {
+    **dict.fromkeys(("val", "valid", "validation", "eval", "evaluation", "testing", "held_out", "holdout"), "test"),
+    **dict.fromkeys(("training", "train_frames"), "train"),
+    **dict.fromkeys(("ids", "frame_ids", "images", "timesteps", "all"), "frames"),
+    **dict.fromkeys(("segments", "shots", "scenes", "breaks"), "cuts (pairs: the last frame before, the first after)"),
+    **dict.fromkeys(("val_camera", "held_out_camera", "test_cameras"), "test_camera"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +139,9 @@ def read_splits(root: Path) -> Splits:
         raise DataError.of(path, expected="a mapping with frames", found=type(stored).__name__)
     for key in stored:
         if key not in _SPLITS:
-            raise DataError(f"{path}: unknown key '{key}'; {did_you_mean(str(key), _SPLITS)}")
+            meant = _LIKE_SPLITS.get(str(key).lower())
+            hint = f"did you mean {meant}?" if meant else did_you_mean(str(key), _SPLITS)
+            raise DataError(f"{path}: unknown key '{key}'; {hint}")
     frames = _ids(stored, "frames", path)
     if not frames:
         raise DataError.of(path, "frames", expected="at least one frame id", found="none")
@@ -259,7 +268,8 @@ def _check_vertices(verts: np.ndarray, faces: np.ndarray, path: Path, name: str,
         raise DataError.of(path, name, expected=f"{count} vertices as in topology.npz", found=len(verts))
     if faces.max() >= len(verts):
         expected = f"more than {int(faces.max())} vertices, as the faces of topology.npz need"
-        raise DataError.of(path, name, expected=expected, found=len(verts))
+        fix = "faces count from 0" if faces.min() == 1 else ""
+        raise DataError.of(path, name, expected=expected, found=len(verts), fix=fix)
     if not np.isfinite(verts).all():
         bad = int(np.flatnonzero(~np.isfinite(verts).all(axis=1))[0])
         raise DataError.of(path, name, expected="finite coordinates", found=f"NaN or infinity at vertex {bad}")

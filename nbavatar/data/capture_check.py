@@ -214,11 +214,6 @@ def _check_camera(
             continue
         if masks.mask is not None and masks.mask.kind == "label":
             labels |= set(np.unique(mask).tolist())
-            if alpha is not None and not ((alpha > 0) & (mask > 0)).any() and (mask > 0).any():
-                line = DataError.of(
-                    capture.root / "alpha" / name / frame, expected="coverage where the mask has parts", found="none"
-                )  # fmt: skip
-                found.note(f"alpha agreement {name}", str(line))
             there = mask > 0
         else:
             there = mask > MATTE_THRESHOLD

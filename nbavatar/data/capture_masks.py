@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from nbavatar.camera.pinhole import Camera
+from nbavatar.config.preprocess import MATTE_THRESHOLD
 from nbavatar.data.capture import Capture, read_splits, read_topology
 from nbavatar.data.mask_values import LABELS, Meaning, ValueSurvey, spread
 from nbavatar.data.pictures import find_picture
@@ -14,6 +15,9 @@ from nbavatar.errors import DataError
 from nbavatar.io.pictures import read_plane
 
 __all__ = ["CameraMasks", "open_masks"]
+
+_COMPARED = 16  # frames in which labels and coverage are compared
+_LEAST_COVERED = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +66,26 @@ def open_masks(capture: Capture, camera: Camera, frames: Sequence[str]) -> Camer
             parts = list(read_topology(capture.root))
         meaning = masks.masks(capture.root / "masks" / camera.name, parts)
     coverage = None if alpha is None else alpha.coverage(capture.root / "alpha" / camera.name)
-    return CameraMasks(capture.root, camera, meaning, coverage)
+    opened = CameraMasks(capture.root, camera, meaning, coverage)
+    if meaning is not None and meaning.kind == "label" and coverage is not None:
+        _compare(opened, spread(frames, _COMPARED))
+    return opened
+
+
+def _compare(masks: CameraMasks, frames: Sequence[str]) -> None:
+    """Refuses alpha images that are another picture than the labels: inverted, of other frames, of another camera."""
+    labelled, covered, elsewhere = 0, 0, 0
+    for frame in frames:
+        label, alpha = masks.read_mask(frame), masks.read_coverage(frame)
+        if label is not None and alpha is not None:
+            labelled += int((label > 0).sum())
+            covered += int(((label > 0) & (alpha > MATTE_THRESHOLD)).sum())
+            elsewhere += int(((label == 0) & (alpha > MATTE_THRESHOLD)).sum())
+    if labelled and covered < _LEAST_COVERED * labelled:
+        where = masks.root / "alpha" / masks.camera.name
+        found = f"{covered / labelled:.0%} of the labelled pixels covered, and {elsewhere} pixels elsewhere"
+        fix = "are they inverted?" if elsewhere > labelled else "do they belong to these frames?"
+        raise DataError.of(where, expected="coverage where the masks have labels", found=found, fix=fix)
 
 
 def _survey(capture: Capture, camera: Camera, kind: str, frames: Sequence[str]) -> ValueSurvey | None:

@@ -25,7 +25,7 @@ _END = 1 / 8  # share of the matte's range that counts as an end
 # Most of the foreground that may lie flat between the ends, and that may lie there at all: in masks of few values and
 # of many, and in coverage, where fine hair and veils are.
 _FEW_VALUES, _MANY_VALUES, _COVERAGE = (0.002, 0.6), (0.05, 0.6), (0.5, 1.0)
-_FEW = 16
+_FEW = 32
 _SOFT = 32  # a matte of more than two values has more than so many levels
 _FULL = 0.75  # a matte whose foreground is above this share of its format's range is not scaled
 _PATCH = 0.002  # share of a picture that is flat and holds labels, when the other pictures are mattes
@@ -164,8 +164,9 @@ class ValueSurvey:
         between[int(peak * _END) + 1 : int(np.ceil(peak * (1 - _END)))] = True
         between[int(peak * (1 + _END)) + 1 :] = True
         foreground = counts[int(peak * _END) + 1 :].sum()
+        low = self._flat[1 : int(peak * _END) + 1].sum() / foreground  # labels beside one that stands for "unknown"
         flat, soft = self._flat[between].sum() / foreground, counts[between].sum() / foreground
-        if white < _SOFT or flat > most[0] or soft > most[1]:
+        if white < _SOFT or flat > most[0] or soft > most[1] or (self._few() and low > most[0]):
             raise DataError.of(
                 where,
                 "values",

@@ -19,6 +19,7 @@ from nbavatar.mesh.topology import edges, mesh_defects
 __all__ = ["mesh_faults"]
 
 _MOST_APART = 1.5  # factor between edges of one part at two times
+_MOST_GROWN = 1.25  # factor of a part's size at two times
 _SAMPLES = 64
 _MIRRORED = 0.2  # share of the usual volume, with the other sign
 _MOST_INCONSISTENT = 0.01  # share of edges between faces of opposite winding
@@ -75,16 +76,17 @@ def mesh_faults(
 
 def _wrong_edges(verts: np.ndarray, pairs: np.ndarray, reference: np.ndarray) -> str:
     lengths = edge_lengths(verts, pairs)
-    factor = edges_apart(lengths, reference)
-    if factor > _MOST_APART:
-        return f"lengths that differ by a factor of {factor:.3g}"
+    apart, grown = edges_apart(lengths, reference)
+    if apart > _MOST_APART or grown > _MOST_GROWN:
+        return f"lengths that differ by a factor of {apart:.3g}"
     diagonal = float(np.linalg.norm(np.ptp(np.asarray(verts, np.float64), axis=0)))
     torn = torn_edges(lengths, reference, diagonal)
     if not len(torn):
         return ""
     worst = int(torn[np.argmax(lengths[torn])])
     a, b = pairs[worst]
-    return f"{lengths[worst]:.3g} m instead of {reference[worst]:.3g} m between vertices {a} and {b}"
+    others = f" and {len(torn) - 1} others" if len(torn) > 1 else ""
+    return f"{lengths[worst]:.3g} m instead of {reference[worst]:.3g} m between vertices {a} and {b}{others}"
 
 
 def _line(where: Path, field: str, expected: str, found: str, fix: str) -> str:

@@ -25,7 +25,7 @@ PICTURE_TYPES = (".jpg", ".jpeg", ".png", ".webp")
 _FORMATS = ("JPEG", "PNG", "WEBP")
 _MOST_PIXELS = 89_000_000
 _ORIENTATION = 0x0112
-_NEUTRAL = {False: 2, True: 12}  # largest difference between the channels of grey pixels, without and with loss
+_NEUTRAL = {False: 0, True: 12}  # largest difference between the channels of grey pixels, without and with loss
 _KINDS = {
     b"version https://git-lfs": ("a pointer of Git LFS in its place", "fetch the file itself with: git lfs pull"),
     b"%!PS": ("PostScript", ""),

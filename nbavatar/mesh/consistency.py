@@ -17,8 +17,12 @@ __all__ = ["edge_lengths", "edges_apart", "reference_lengths", "seam_welds", "si
 _SEAM = 1e-6  # distance of coincident vertices, as a share of the part's diagonal
 _SEAM_LATER = 1e-5  # the same in the other frames
 _CROWD = 32  # most vertices that are one, on average
-_STRETCH = 4.0  # factor and length, as a share of the part's diagonal, of edges that are torn
-_LONG = 0.3
+_STRETCH = 4.0  # factor by which edges are too long
+_LONG, _SHORT = (
+    0.3,
+    0.01,
+)  # shares of the part's diagonal: edges that are torn alone, or if many are
+_MOUTH = 0.01  # share of a part's edges
 
 
 def edge_lengths(verts: np.ndarray, pairs: np.ndarray) -> np.ndarray:
@@ -33,22 +37,35 @@ def reference_lengths(frames: Sequence[np.ndarray], pairs: np.ndarray) -> np.nda
     return lengths[(len(frames) - 1) // 2]
 
 
-def edges_apart(lengths: np.ndarray, reference: np.ndarray) -> float:
-    """How far edges are from their reference: the factor, at least 1, that half of them are off by or more.
+def edges_apart(lengths: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
+    """How far edges are from their reference, as two factors, at least 1.
 
     Faces deform, but half of a face's edges never change by much; those of vertices in another order, or of another
     unit, all do.
+
+    Returns:
+        the factor that half of the edges are off by or more, up or down; and the factor of their middle, which is 1 if
+        as many have grown as have shrunk.
     """
     long = reference > 1e-9 * reference.max(initial=0.0)
     if not long.any():
-        return 1.0
+        return 1.0, 1.0
     with np.errstate(divide="ignore"):
-        return float(np.exp(np.median(np.abs(np.log(lengths[long] / reference[long])))))
+        change = np.log(lengths[long] / reference[long])
+    return float(np.exp(np.median(np.abs(change)))), float(np.exp(np.abs(np.median(change))))
 
 
 def torn_edges(lengths: np.ndarray, reference: np.ndarray, diagonal: float) -> np.ndarray:
-    """Ids of edges that reach over much of the part and are many times as long as they should be."""
-    return np.flatnonzero((lengths > _STRETCH * reference) & (lengths > _LONG * diagonal))
+    """Ids of edges that are many times as long as they should be.
+
+    One that reaches over much of the part is torn. Shorter ones may be a mouth that opens: they are torn if there are
+    more of them than a mouth has.
+    """
+    stretched = lengths > _STRETCH * reference
+    many = stretched & (lengths > _SHORT * diagonal)
+    if many.mean() > _MOUTH:
+        return np.flatnonzero(many)
+    return np.flatnonzero(stretched & (lengths > _LONG * diagonal))
 
 
 def signed_volume(verts: np.ndarray, faces: np.ndarray) -> float:

@@ -170,7 +170,15 @@ LOUD = {
     "a fourth label": (pictures("masks", lambda v: v * 2), "ingest", "values 0, 2, 4;"),
     "labels in jpg": (pictures("masks", lambda v: v, ".jpg"), "ingest", "masks/left: values: expected labels 0..3"),
     "stretched labels in jpg": (pictures("masks", lambda v: v * 85, ".jpg"), "ingest", "expected labels 0..3, or a"),
+    "labels in red": (pictures("masks", lambda v: np.dstack([v, v * 0, v * 0])), "ingest", "colours: (1, 0, 0), (2"),
+    "labels and an unknown rim": (
+        pictures("masks", lambda v: np.pad(v[3:-3, 3:-3], 3, constant_values=255)), "ingest", "values 0, 1, 2, 255",
+    ),
     "coloured labels": (pictures("masks", lambda v: np.eye(4, 3, -1, np.uint8)[v] * 255), "ingest", "found colours: ("),
+    "alpha inverted": (
+        after(also_alpha, pictures("alpha", lambda v: 255 - v)),
+        "ingest", "alpha/left: expected coverage where the masks have labels, found 0%",
+    ),
     "labels stretched in alpha": (
         lambda c: shutil.copytree(c / "masks", c / "alpha"), "ingest", "alpha/left: values: expected coverage",
     ),

@@ -95,6 +95,7 @@ def test_cuts_divide_runs(capture):
         (lambda s: s.update(cuts=["t1"]), "pairs of frame ids"),
         (lambda s: s.update(cuts=[["1", "2"]]), "cuts: expected pairs of ids that are in frames, found '1'"),
         (lambda s: s.update(cuts=[["t2", "t1"]]), "cut 0: expected .* found .2, 1."),
+        (lambda s: s.update(validation=["t1"]), "unknown key 'validation'; did you mean test?"),
         (lambda s: s.update(cut=[["t1", "t2"]]), "unknown key 'cut'; did you mean 'cuts'"),
     ],
 )

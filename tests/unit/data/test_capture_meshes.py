@@ -42,6 +42,7 @@ def tracks(capture):
     [
         (both_heads(lambda v: np.random.default_rng(0).permutation(v)), "lengths that differ by a factor of"),
         (both_heads(lambda v: v * 1000), "lengths that differ by a factor of 1e.03"),
+        (both_heads(lambda v: v * 1.3), "lengths that differ by a factor of 1.3"),
         (both_heads(exchanged), "m instead of .* m between vertices"),
         (lambda a: a.update(head_rigid=a["head_rigid"][::-1]), "head_rigid: expected edges as long"),
         (lambda a: a.update(right_hand=a["right_hand"][::-1]), "right_hand: expected edges as long"),

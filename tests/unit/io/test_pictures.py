@@ -79,6 +79,9 @@ def test_colours_are_no_plane_and_greys_in_three_channels_are(tmp_path, colours)
     Image.fromarray(colours).save(tmp_path / "a.png")
     with pytest.raises(DataError, match="expected one value a pixel, found colours: "):
         read_plane(tmp_path / "a.png")
+    Image.fromarray(np.dstack([LABELS, 0 * LABELS, 0 * LABELS])).save(tmp_path / "a.png")
+    with pytest.raises(DataError, match=r"found colours: \(1, 0, 0\), \(2, 0, 0\), \(3, 0, 0\)"):
+        read_plane(tmp_path / "a.png")
     Image.fromarray(np.dstack([LABELS] * 3)).save(tmp_path / "a.png")
     np.testing.assert_array_equal(read_plane(tmp_path / "a.png").values, LABELS)
     matte = np.zeros((32, 32), np.uint8)
