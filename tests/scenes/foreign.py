@@ -8,6 +8,7 @@ import functools
 import json
 import pickle
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -302,3 +303,10 @@ def write_colmap(
             lines += ["1.5 2.5 -1 3.5 4.5 7" if key % 2 else ""]
         (folder / "images.txt").write_text("# Image list\n" + "\n".join(lines) + "\n")
     return root
+
+
+def edit(path: Path, change: Callable) -> None:
+    """Changes a JSON file."""
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
