@@ -42,6 +42,7 @@ _OPTIONAL = {
     "cupy": "GPU",
     "gsplat": "another backend for 3D Gaussians on a GPU",
     "pycolmap": "another reader of COLMAP's files",
+    "transformers": "masks by SAM 3",
 }
 _BODY_MODELS = {
     "flame": ("assets/generic_model.pkl", "flame"),

@@ -37,7 +37,7 @@ class Sam3:
     """
 
     def __init__(self, folder: Path, prompts: Mapping[str, str], device: str = "cpu") -> None:
-        transformers = require("transformers", "'nbavatar[segment]'", "segmentation by SAM 3")
+        transformers = require("transformers", "transformers", "segmentation by SAM 3")
         if not (folder / "config.json").is_file():
             raise DependencyError.of(folder, expected="a folder with SAM 3's weights", found="no config.json", fix=GET)
         try:
@@ -75,7 +75,7 @@ class Sam3:
                 _forget(session, number - _KEPT)
 
     def _session(self) -> Any:
-        module = require("transformers.models.sam3_video.modeling_sam3_video", "'nbavatar[segment]'", "SAM 3")
+        module = require("transformers.models.sam3_video.modeling_sam3_video", "transformers", "SAM 3")
         session = module.Sam3VideoInferenceSession(
             inference_device=self._device, inference_state_device=self._device, video_storage_device=self._device,
             dtype=torch.float32,
