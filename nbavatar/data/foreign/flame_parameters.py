@@ -18,7 +18,7 @@ import torch
 
 from nbavatar.bodymodels.files import read_flame
 from nbavatar.bodymodels.flame import Flame
-from nbavatar.data.foreign.mesh_files import matching
+from nbavatar.data.foreign.mesh_files import FrameFiles
 from nbavatar.errors import DataError
 from nbavatar.io.arrays import read_arrays
 
@@ -41,10 +41,10 @@ class FlameSequence:
     """
 
     def __init__(self, model: Path, files: Mapping[str, Path]) -> None:
-        self._arrays, self._files = read_flame(model), dict(files)
+        self._arrays, self._files = read_flame(model), FrameFiles(files)
         self._flame = Flame.build(self._arrays, shape_count=300, expression_count=100, dtype=torch.float64)
         self.notes: list[str] = []
-        first = next(iter(self._files.values()))
+        first = next(iter(files.values()))
         stored, _ = read_arrays(first)
         extra = {key: stored[key].size // 3 for key in _OFFSETS if key in stored}
         if any(count == len(self._arrays.template) + _TEETH for count in extra.values()):
@@ -57,7 +57,7 @@ class FlameSequence:
 
     def vertices(self, frame: str) -> Mapping[str, np.ndarray]:
         """See `Meshes`."""
-        path = matching(frame, self._files)
+        path = self._files.get(frame)
         return {} if path is None else {"head": self._pose(self._read(path))}
 
     def _read(self, path: Path) -> dict[str, np.ndarray]:

@@ -16,9 +16,21 @@ from nbavatar.errors import DataError
 from nbavatar.io.meshfiles import MESH_TYPES, read_mesh_file
 from nbavatar.mesh.repair import repair_faces
 
-__all__ = ["JoinedMeshes", "MeshFiles", "SequenceMeshes", "find_mesh_files", "open_meshes"]
+__all__ = ["FrameFiles", "JoinedMeshes", "MeshFiles", "SequenceMeshes", "find_mesh_files", "open_meshes"]
 
 _REST = "rest"
+
+
+class FrameFiles:
+    """Files by frame: of its name, or of the same number with other zero padding."""
+
+    def __init__(self, files: Mapping[str, Path]) -> None:
+        self._names = dict(files)
+        self._numbers = {int(name): path for name, path in files.items() if name.isdecimal()}
+
+    def get(self, frame: str) -> Path | None:
+        """The file of a frame, if there is one."""
+        return self._names.get(frame) or (self._numbers.get(int(frame)) if frame.isdecimal() else None)
 
 
 class MeshFiles:
@@ -39,6 +51,7 @@ class MeshFiles:
         repair: bool = False,
     ) -> None:  # fmt: skip
         self._files, self._scale = {part: dict(frames) for part, frames in files.items()}, scale
+        self._by_frame = {part: FrameFiles(frames) for part, frames in self._files.items()}
         self._rest: dict[str, np.ndarray | None] = {}
         self._stored: dict[str, np.ndarray] = {}  # faces as they are in the files
         self._faces: dict[str, np.ndarray] = {}
@@ -62,8 +75,8 @@ class MeshFiles:
     def vertices(self, frame: str) -> Mapping[str, np.ndarray]:
         """See `Meshes`."""
         result = {}
-        for part, files in self._files.items():
-            path = matching(frame, files)
+        for part, files in self._by_frame.items():
+            path = files.get(frame)
             if path is not None:
                 result[part] = self._read(part, path)
         return result
@@ -146,15 +159,6 @@ def find_mesh_files(folder: Path, *, scale: float = 1.0, repair: bool = False) -
             folder, expected=f"<frame>{' or <frame>'.join(MESH_TYPES)}, here or in {', '.join(PARTS)}", found="none"
         )
     return MeshFiles(files, rest=rest, scale=scale, repair=repair)
-
-
-def matching(frame: str, files: Mapping[str, Path]) -> Path | None:
-    """The file of a frame: of its name, or of the same number with other zero padding."""
-    if frame in files:
-        return files[frame]
-    if not frame.isdecimal():
-        return None
-    return next((path for name, path in files.items() if name.isdecimal() and int(name) == int(frame)), None)
 
 
 def _listed(folder: Path) -> dict[str, Path]:

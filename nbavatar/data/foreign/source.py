@@ -127,7 +127,8 @@ def grid(source: Source) -> tuple[list[str], list[str], dict[tuple[str, str], Sh
             fix="say with --names what in a picture's name is the camera and what the frame",
         )  # fmt: skip
     if len(whole) < len(frames):
-        lost = next(frame for frame in frames if frame not in set(whole))
+        kept = set(whole)
+        lost = next(frame for frame in frames if frame not in kept)
         source.notes.append(
             f"{len(frames) - len(whole)} of {len(frames)} frames left out: not all cameras took them (first: {lost})"
         )
