@@ -66,7 +66,8 @@ class Meaning:
 
 def spread(names: Sequence[str], most: int = 256) -> list[str]:
     """At most so many names, evenly spread: enough to see what kind of masks another camera has."""
-    return [names[i] for i in np.unique(np.linspace(0, len(names) - 1, min(most, len(names))).astype(int))]
+    places = np.unique(np.linspace(0, len(names) - 1, min(most, len(names))).astype(int))
+    return [names[int(place)] for place in places]
 
 
 class ValueSurvey:
