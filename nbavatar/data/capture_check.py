@@ -139,11 +139,11 @@ def _cameras(root: Path, found: _Collector) -> dict[str, Camera]:
 def _check_meshes(capture: Capture, report: CaptureReport, found: _Collector) -> dict[str, dict[str, np.ndarray]]:
     root = capture.root
     meshes: dict[str, dict[str, np.ndarray]] = {}
+    first: dict[str, np.ndarray] = {}
     for frame in report.frames:
         mesh = found.attempt("meshes", lambda: read_mesh(capture, frame, report.topology))  # noqa: B023
         if mesh is None:
             continue
-        first = {name: verts for earlier in reversed(meshes.values()) for name, verts in earlier.items()}
         path = root / "meshes" / f"{frame}.npz"
         if {n: v.shape for n, v in mesh.items() if n in first} != {n: v.shape for n, v in first.items() if n in mesh}:
             found.note("counts", f"{path}: expected as many vertices as in the frames before, found another number")
@@ -160,6 +160,7 @@ def _check_meshes(capture: Capture, report: CaptureReport, found: _Collector) ->
                     )
                     found.note(f"size {part}", str(error))
         meshes[frame] = mesh
+        first = mesh | first
     if meshes:
         for part, (faces, rest) in report.topology.items():
             mesh = next((mesh for mesh in meshes.values() if part in mesh), None)

@@ -107,6 +107,19 @@ def test_many_alike_are_one_line_with_a_count(capture, capfd):
     assert len(lines) == 2 and "(and 4 more like it)" in lines[0]
 
 
+def test_what_is_unusual_is_noted(capture, capfd):
+    write_json(capture / "splits.json", lambda d: d.update(frames=["t0", "t10", "t2", "t3"]))
+    for path in capture.glob("*/*/t1.png"):
+        path.rename(path.with_name("t10.png"))
+    (capture / "meshes/t1.npz").rename(capture / "meshes/t10.npz")
+    for path in capture.glob("masks/*/*"):
+        Image.fromarray(np.where(np.array(Image.open(path)) > 0, 40, 0).astype(np.uint8)).save(path)
+    assert main(["check", str(capture)]) == 0
+    notes = [line for line in capfd.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert "splits.json: frames: t10 comes before t2" in notes[0]
+    assert "masks/left: a matte in which 40 is full coverage" in notes[1] and len(notes) == 3
+
+
 def test_no_capture(tmp_path, capfd):
     assert main(["check", str(tmp_path / "none")]) == 2
     assert "expected the folder of a capture, found no such folder" in errors(capfd)[0]
