@@ -6,6 +6,7 @@ project's rule (`safe_names`): nothing in a source decides where a file is writt
 """
 
 import dataclasses
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -187,7 +188,7 @@ def inside(folder: Path, text: object, allowed: Path, where: str) -> Path:
     Raises:
         DataError: no text, or a path that leaves `allowed`.
     """
-    if not isinstance(text, str) or not text or "\0" in text:
+    if not isinstance(text, str) or not _is_path(text):
         raise DataError.of(where, expected="a path", found=repr(text)[:60])
     path = folder / text
     if "\\" in text and not path.exists():
@@ -198,6 +199,15 @@ def inside(folder: Path, text: object, allowed: Path, where: str) -> Path:
             fix="if the files are yours, name the folder that holds them all with --within",
         )  # fmt: skip
     return path
+
+
+def _is_path(text: str) -> bool:
+    """Whether a file system can be asked for it at all."""
+    try:
+        encoded = os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
+    return 0 < len(encoded) < 4000 and b"\0" not in encoded and max(map(len, encoded.split(b"/"))) < 250
 
 
 def picture(path: Path, where: str) -> Path:
