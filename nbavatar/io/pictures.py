@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from nbavatar.errors import DataError
+from nbavatar.errors import DataError, parsing
 
 __all__ = ["PICTURE_TYPES", "Plane", "picture_size", "read_colours", "read_plane"]
 
@@ -121,24 +121,19 @@ def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 @contextlib.contextmanager
 def _opened(path: str | os.PathLike[str], size: tuple[int, int] | None) -> Iterator[tuple[Image.Image, int]]:
     """The opened picture, of the right size once it is turned, and its EXIF orientation."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+    # Pillow warns of what it goes on with; what it cannot go on with it raises.
+    with warnings.catch_warnings(), parsing(path, "a whole image", damaged="one that does not decode"):
+        warnings.simplefilter("ignore")
+        try:
             image = Image.open(Path(path), formats=_FORMATS)
+        except Image.UnidentifiedImageError as error:
+            found, fix = _kind_of(path)
+            raise DataError.of(path, expected="a whole image (jpg, png or webp)", found=found, fix=fix) from error
         with image:
             turn = image.getexif().get(_ORIENTATION, 1)
             turn = turn if turn in range(1, 9) else 1
             _check_size(path, image, turn, size)
             yield image, turn
-    except FileNotFoundError as error:
-        raise DataError.of(path, expected="an image", found="no such file") from error
-    except (DataError, MemoryError):
-        raise
-    except Image.UnidentifiedImageError as error:
-        found, fix = _kind_of(path)
-        raise DataError.of(path, expected="a whole image (jpg, png or webp)", found=found, fix=fix) from error
-    except Exception as error:  # what Pillow raises on damaged content is of any kind
-        raise DataError.of(path, expected="a whole image", found=f"one that does not decode ({error})") from error
 
 
 def _check_size(path: str | os.PathLike[str], image: Image.Image, turn: int, size: tuple[int, int] | None) -> None:
