@@ -55,7 +55,7 @@ def read_mesh_file(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray
 
 
 def _read_obj(content: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    positions: list[list[bytes]] = []
+    positions: list[tuple[float, float, float]] = []
     polygons: list[tuple[int, list[bytes]]] = []
     line = b""
     try:
@@ -63,7 +63,7 @@ def _read_obj(content: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]:
             words = line.split()
             if words[:1] == [b"v"]:
                 x, y, z, *_ = words[1:]
-                positions.append([x, y, z])
+                positions.append((float(x), float(y), float(z)))
             elif words[:1] == [b"f"]:
                 polygons.append((len(positions), words[1:]))
         verts = np.array(positions, dtype=np.float64).reshape(-1, 3)
