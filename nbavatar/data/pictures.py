@@ -38,6 +38,8 @@ def find_picture(folder: Path, name: str) -> Path | None:
         raise DataError.of(
             folder / files[0], expected="an image (jpg, png or webp)", found=Path(files[0]).suffix, fix=fix
         )
+    if known and not (folder / known[0]).is_file():  # a pipe of that name would be waited for without end
+        raise DataError.of(folder / known[0], expected="an image (jpg, png or webp)", found="no plain file")
     return folder / known[0] if known else None
 
 

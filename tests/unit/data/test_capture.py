@@ -1,4 +1,5 @@
 import json
+import os
 
 import numpy as np
 import pytest
@@ -191,6 +192,14 @@ def test_suffixes_in_any_case_and_others_are_named(capture, files, line):
     else:
         with pytest.raises(DataError, match=line):
             read_rgb(opened, opened.camera("left"), "t1")
+
+
+def test_a_pipe_is_no_picture(capture):
+    (capture / "images/left/t1.png").unlink()
+    os.mkfifo(capture / "images/left/t1.png")
+    opened = open_capture(capture)
+    with pytest.raises(DataError, match=r"t1\.png: expected an image \(jpg, png or webp\), found no plain file"):
+        read_rgb(opened, opened.camera("left"), "t1")
 
 
 def test_an_alpha_image_that_is_missing_is_named(capture):
