@@ -26,7 +26,7 @@ from nbavatar.errors import DataError
 from nbavatar.io.records import write_json
 from nbavatar.processes import alive, machine
 
-__all__ = ["RUN_VARIABLE", "end_run", "leave_guard", "run_workflow", "supervised", "wait"]
+__all__ = ["RUN_VARIABLE", "end_run", "leave_guard", "run_workflow", "supervised", "told_to_end", "wait"]
 
 RUN_VARIABLE = "NBAVATAR_RUN"
 """Environment variable with the token of the run that a process belongs to."""
@@ -34,6 +34,8 @@ RUN_VARIABLE = "NBAVATAR_RUN"
 _GRACE_S = 10.0  # for a training to save its state, for Snakemake to remove its lock
 _OWN_LOCKS = {"0.input.lock", "0.output.lock"}  # of a run that is the only one of its folder
 _GUARD_PIPES: set[int] = set()
+_TOLD: list[int] = []
+_POLL_S = 0.2
 _MOST_STREAMS = 1 << 16
 _RECORD = "nbavatar-run.json"
 # First as the keyboard would: Snakemake then ends its jobs and removes its lock.
@@ -77,7 +79,8 @@ def supervised(
 ) -> Iterator["subprocess.Popen[bytes]"]:
     """Starts a command; when the block ends, nothing of what the command started is left.
 
-    SIGTERM ends the block by `SystemExit` with code 143. A process in which this is used must not have started threads.
+    SIGTERM is noted, for `told_to_end`; the block should then end. A process in which this is used must not have
+    started threads.
 
     Args:
         command: program and arguments.
@@ -87,7 +90,9 @@ def supervised(
     """
     outer = os.environ.get(RUN_VARIABLE) if token is None else None
     token = outer or token or f"{machine()}-{os.getpid()}-{secrets.token_hex(8)}"
-    former = signal.signal(signal.SIGTERM, _terminated)
+    _TOLD.clear()
+    # Noted, not raised: an exception out of a handler is lost where the interpreter runs hooks, as around a fork.
+    former = signal.signal(signal.SIGTERM, lambda *_: _TOLD.append(signal.SIGTERM))
     # The outer run has a guard, and ends what is left of this one.
     guard = contextlib.nullcontext() if outer else _guarded(token)
     try:
@@ -104,20 +109,28 @@ def supervised(
         signal.signal(signal.SIGTERM, former)
 
 
+def told_to_end() -> bool:
+    """Whether this process was sent SIGTERM while it supervised a command."""
+    return bool(_TOLD)
+
+
 def wait(process: "subprocess.Popen[bytes]") -> int:
-    """Waits for a command; its exit code, 128 and the signal's number if a signal ended it.
+    """Waits for a command; its exit code, 128 and the signal's number if a signal ended it; 143 when told to end.
 
     An interrupt from the keyboard reaches the command too, which is left to end in its own way; a second one is ours.
     """
     interrupted = False
-    while True:
+    while not told_to_end():
         try:
-            code = process.wait()
+            code = process.wait(_POLL_S)
             return code if code >= 0 else 128 - code
+        except subprocess.TimeoutExpired:
+            continue
         except KeyboardInterrupt:
             if interrupted:
                 raise
             interrupted = True
+    return 128 + signal.SIGTERM
 
 
 def end_run(token: str, grace_s: float = _GRACE_S) -> int:
@@ -157,10 +170,6 @@ def _members(token: str) -> list[Any]:
                 if ours and process.status() != psutil.STATUS_ZOMBIE:
                     found.append(process)
     return found
-
-
-def _terminated(*_: object) -> None:
-    raise SystemExit(143)
 
 
 def _end(process: "subprocess.Popen[bytes]", order: Sequence[signal.Signals]) -> None:

@@ -33,7 +33,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nbavatar.cli import SOCKET_VARIABLE
-from nbavatar.cli.supervision import leave_guard, supervised, wait
+from nbavatar.cli.supervision import leave_guard, supervised, told_to_end, wait
 from nbavatar.errors import ConfigError
 from nbavatar.processes import alive, machine
 
@@ -148,7 +148,7 @@ class _Server:
         """Serves until the command ends; returns its exit code."""
         interrupted = False
         try:
-            while process.poll() is None:
+            while process.poll() is None and not told_to_end():
                 try:
                     self._turn()
                 except KeyboardInterrupt:  # the command has it from the keyboard too, and ends in its own way
@@ -156,9 +156,8 @@ class _Server:
                         raise
                     interrupted = True
         finally:
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
             self._end_jobs()
-        return process.returncode if process.returncode >= 0 else 128 - process.returncode
+        return wait(process)
 
     def _turn(self) -> None:
         self._reap()
@@ -223,6 +222,8 @@ class _Server:
         signal.set_wakeup_fd(-1)
         for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT):
             signal.signal(number, signal.SIG_DFL if number != signal.SIGINT else signal.default_int_handler)
+        if told_to_end():  # after the fork, before the line above
+            os._exit(128 + signal.SIGTERM)
         self._selector.close()
         self._listener.close()
         for stream in (self._woken, self._wake):

@@ -4,27 +4,27 @@
     events.jsonl    one line per logged step
     tensorboard/    the same numbers and the previews as event files
     key.json        what the state belongs to: configuration, code and inputs
-    lock            held while a training writes here; the system frees it however the training ends
+    lock            held while a training writes here (`nbavatar.io.locks`)
     previews/       pictures, named by step
 
 A folder whose key differs belongs to another experiment; it is moved aside, never mixed and never deleted.
 """
 
-import fcntl
 import json
 import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
 
-from nbavatar.errors import DataError, parsing
+from nbavatar.errors import parsing
 from nbavatar.io.atomic import atomic_write, storage_errors
 from nbavatar.io.eventfile import EventFile
 from nbavatar.io.images import encode_png
+from nbavatar.io.locks import Hold, hold
 from nbavatar.io.records import canonical_json, write_json
 from nbavatar.io.tensors import read_tensors
 
@@ -64,17 +64,10 @@ class RunFolder:
         if not key_file.exists():
             write_json(key_file, dict(key))
 
-    def _claim(self) -> IO[str]:
-        """The open lock of the folder, which is made when missing."""
+    def _claim(self) -> Hold:
+        """The lock of the folder, which is made when missing."""
         self.path.mkdir(parents=True, exist_ok=True)
-        lock = open(self.path / "lock", "a", encoding="utf-8")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            found, fix = "another training that writes to it", "wait for its end or stop it"
-            raise DataError.of(self.path, expected="a folder of its own", found=found, fix=fix) from None
-        return lock
+        return hold(self.path / "lock", "another training that writes to it")
 
     @staticmethod
     def _belongs(key_file: Path, key: Mapping[str, Any]) -> bool:

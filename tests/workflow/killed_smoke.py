@@ -1,0 +1,127 @@
+"""Kills the smoke run at random moments, runs it once more, and compares its tables with those of an unbroken run.
+
+    python tests/workflow/killed_smoke.py --kills 10 --seed 1 --folder /tmp/killed
+
+No test of the suite: it takes as long as three smoke runs. Each kill (SIGKILL) hits one process at random of those that
+are there: `nbavatar run`, its guard, `nbavatar warm`, Snakemake, a shell, a job. What is chosen is drawn from
+the seed and printed; the moments of the machine are not, so that no two calls are alike in all. After each kill it is
+checked that no process of the run goes on for longer than the time in which it is allowed to save its state.
+
+Compared byte by byte: all tables in all formats but for measured times, and every evaluated figure. Exit code 0 if all
+are the same, no temporary file is left, and no process outlived its run; 1 otherwise.
+"""
+
+import argparse
+import json
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+
+PATIENCE_S = 40.0  # of the guard and of Snakemake: three times ten seconds, and the machine is busy
+TIMED = ("speed",)  # tables of measured times
+
+
+def main() -> int:
+    """Does what the module says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--longest", type=float, default=60.0, help="latest moment of a kill [s]")
+    parser.add_argument("--targets", nargs="*", default=[], help="targets of Snakemake instead of the whole run")
+    parser.add_argument("--folder", type=Path, required=True, help="a new folder for both runs")
+    arguments = parser.parse_args()
+    draw = random.Random(arguments.seed)
+    print(f"seed {arguments.seed}, {arguments.kills} kills", flush=True)
+    whole, broken = arguments.folder / "whole", arguments.folder / "broken"
+    for folder in (whole, broken):
+        folder.mkdir(parents=True)
+    began = time.monotonic()
+    if run(whole, arguments.targets).wait() != 0:
+        print(f"the unbroken run failed: {(whole / 'log').read_text()[-3000:]}")
+        return 1
+    print(f"unbroken run: {time.monotonic() - began:.0f} s", flush=True)
+    faults, done = [], 0
+    while done < arguments.kills:
+        delay = draw.uniform(1.0, arguments.longest)
+        process = run(broken, arguments.targets)
+        try:
+            code = process.wait(delay)
+            print(f"  the run was through after {done} kills, code {code}: {arguments.kills - done} kills not needed")
+            break
+        except subprocess.TimeoutExpired:
+            pass
+        done += 1
+        family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+        victim = draw.choice(sorted(family, key=lambda member: member.pid))
+        try:
+            name = " ".join(victim.cmdline()[1:5])
+            victim.kill()
+        except psutil.Error:
+            name = "one that had just ended"
+        print(f"  kill {done} after {delay:.1f} s: {name}", flush=True)
+        # A job or a shell that is killed is Snakemake's to judge: it tries again or ends the run.
+        if victim.pid != process.pid and psutil.pid_exists(process.pid) and "snakemake" not in name:
+            try:
+                process.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+        process.wait(10 * PATIENCE_S)
+        _, left = psutil.wait_procs(family, timeout=PATIENCE_S)
+        if left:
+            faults.append(f"kill {done}: {[member.pid for member in left]} went on")
+    began = time.monotonic()
+    last = run(broken, arguments.targets)
+    if last.wait() != 0:
+        faults.append(f"the last run failed: {(broken / 'log').read_text()[-3000:]}")
+    print(f"last run: {time.monotonic() - began:.0f} s", flush=True)
+    faults += differences(whole / "results/smoke", broken / "results/smoke")
+    faults += [f"left: {path}" for path in broken.rglob(".*.tmp*")]
+    print("\n".join(faults) or f"{done} kills survived: the same tables, nothing left")
+    return 1 if faults else 0
+
+
+def run(folder: Path, targets: list[str]) -> "subprocess.Popen[bytes]":
+    """Starts the smoke run in a folder."""
+    with open(folder / "log", "ab") as log:
+        command = [
+            sys.executable,
+            "-m",
+            "nbavatar",
+            "run",
+            "smoke",
+            "--cores",
+            "2",
+            *(["--"] if targets else []),
+            *targets,
+        ]
+        return subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+
+
+def differences(one: Path, other: Path) -> list[str]:
+    """What differs between the results of two runs."""
+    found = []
+    files = [path.relative_to(one) for path in sorted(one.glob("tables/*")) if path.stem not in TIMED]
+    if not files:
+        found.append(f"no tables in {one}")
+    for file in files:
+        if not (other / file).is_file() or (one / file).read_bytes() != (other / file).read_bytes():
+            found.append(f"differs: {file}")
+    for path in sorted(one.glob("eval/**/*.json")):
+        twin = other / path.relative_to(one)
+        if not twin.is_file() or figures(path) != figures(twin):
+            found.append(f"differs: {path.relative_to(one)}")
+    return found
+
+
+def figures(path: Path) -> object:
+    """What a record says but for where and when it was made."""
+    content = json.loads(path.read_text())
+    return {key: value for key, value in content.items() if key != "record"}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
