@@ -4,6 +4,7 @@
                                           splits.json), prints one line per defect and ends with exit code 2 if there
                                           is any. With --out, writes DIR/CAMERA.png, the meshes over that camera's
                                           images with the masks outlined in yellow, and DIR/overview.png: look at them.
+                                          The workflow does this first of all, with --overview and --record.
   nbavatar check --layout decaf ROOT      lists in one message which files of the dataset and of the body models are
                                           missing, where to get them and where to put them. If none is, reads every
                                           subject and says how far its stored landmarks lie from the projected models,
@@ -14,20 +15,26 @@ Lengths are metres, cameras map world to camera (OpenCV axes), pixel centres lie
 
 import argparse
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from nbavatar.cli.common import progress
-from nbavatar.config.preprocess import MATTE_THRESHOLD
+from nbavatar.cli.common import add_cfg_argument, progress, stage_config
+from nbavatar.config.core import to_mapping
+from nbavatar.config.preprocess import MATTE_THRESHOLD, CheckConfig
 from nbavatar.data.capture import read_mesh, read_rgb
 from nbavatar.data.capture_check import CaptureReport, check_capture
-from nbavatar.data.capture_masks import CameraMasks
 from nbavatar.data.decaf import CAMERAS, DecafSubject, find_subject
 from nbavatar.data.decaf_check import SubjectReport, check_subject
 from nbavatar.data.decaf_inventory import missing_files, missing_message
+from nbavatar.data.supplied_masks import supplied_masks
+from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.images import encode_png
+from nbavatar.io.records import write_json
+from nbavatar.names import check_name
+from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
 
@@ -44,6 +51,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--cameras", nargs="+", default=list(CAMERAS), help="decaf: cameras that are needed")
     parser.add_argument("--out", metavar="DIR", help="folder for overlays")
+    parser.add_argument("--overview", metavar="PNG", help="capture: one picture of all cameras, if there is no defect")
+    parser.add_argument("--record", metavar="JSON", help="capture: what was found, if there is no defect")
+    parser.add_argument(
+        "--supplied", metavar="DIR", default="", help="capture: masks that are used in place of its own"
+    )
+    parser.add_argument("--subject", default="", help="capture: whose masks are taken from --supplied")
+    parser.add_argument(
+        "--pixel-center", type=float, default=0.5, choices=(0.0, 0.5), metavar="0|0.5",
+        help="capture: where its camera matrices put the centre of pixel (0, 0) [px]; default 0.5",
+    )  # fmt: skip
+    add_cfg_argument(parser, CheckConfig)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -56,7 +74,16 @@ def main(args: argparse.Namespace) -> int:
             print(missing_message(root, missing), file=sys.stderr)
             return 2
         return _check_decaf(root, wanted, Path(args.out) if args.out else None)
-    report = check_capture(root, progress)
+    cfg = stage_config(args, CheckConfig)
+    if args.subject:
+        check_name(args.subject, "--subject", error=ConfigError)
+    report = check_capture(
+        root,
+        progress if sys.stderr.isatty() else lambda items, _: items,
+        pixel_center=args.pixel_center,
+        supplied=args.supplied,
+        subject=args.subject,
+    )
     if args.out and report.capture is not None and report.frames:
         _write_overlays(report, Path(args.out))
     for line in report.notes:
@@ -67,7 +94,16 @@ def main(args: argparse.Namespace) -> int:
         print(f"nbavatar check: error: {line}", file=sys.stderr)
     count = len(report.defects)
     print(f"{root}: {len(report.frames)} frames, {count} defect{'' if count == 1 else 's'}")
-    return 2 if report.defects else 0
+    if report.defects and cfg.stop:
+        return 2
+    if args.overview:
+        _write_sheet(_overview(report), Path(args.overview))
+    if args.record:
+        inputs = {name: root / name for name in ("cameras.json", "splits.json") if (root / name).is_file()}
+        found = {"frames": len(report.frames), "defects": report.defects, "notes": report.notes}
+        found |= {"overlap": report.overlap, "astray": report.astray}
+        write_json(args.record, run_record("check", config=to_mapping(cfg), inputs=inputs, extra=found))
+    return 0
 
 
 def _check_decaf(root: Path, wanted: dict[str, list[str]], out: Path | None) -> int:
@@ -109,43 +145,69 @@ def _write_decaf_sheet(subject: DecafSubject, report: SubjectReport, path: Path)
         temporary.write_bytes(encode_png(contact_sheet(rows, cell=640), level=6))
 
 
-def _outlined(masks: CameraMasks | None, frame: str) -> np.ndarray | None:
+def _outlined(report: CaptureReport, name: str, frame: str) -> np.ndarray | None:
     """What is outlined in a picture: labels, or 1 where a matte is above the threshold."""
-    if masks is None:
+    masks = report.masks.get(name)
+    if report.supplied.folder and report.capture is not None:
+        folder, subject = report.supplied
+        own, meaning = supplied_masks(folder, subject, report.capture.cameras[name], [frame], tuple(report.topology))
+        mask, labelled = next(own), meaning.kind == "label"
+    elif masks is None:
         return None
-    if masks.mask is not None and masks.mask.kind == "label":
-        return masks.read_mask(frame)
-    matte = masks.read_coverage(frame) if masks.mask is None else masks.read_mask(frame)
-    return None if matte is None else (matte > MATTE_THRESHOLD).astype(np.uint8)
+    else:
+        labelled = masks.mask is not None and masks.mask.kind == "label"
+        mask = masks.read_coverage(frame) if masks.mask is None else masks.read_mask(frame)
+    return mask if mask is None or labelled else (mask > MATTE_THRESHOLD).astype(np.uint8)
 
 
 def _write_overlays(report: CaptureReport, out: Path) -> None:
     """One sheet a camera, and an overview; frames that cannot be read are left out (they are defects already)."""
+    assert report.capture is not None
+    chosen = [report.frames[i] for i in np.unique(np.linspace(0, len(report.frames) - 1, _ROWS).astype(int))]
+    for name in report.capture.cameras:
+        rows = [
+            [(f"{name} {frame}", image), ("meshes, outline of masks", over)]
+            for frame, image, over in _overlays(report, name, chosen)
+        ]
+        if rows:
+            _write_sheet(rows, out / f"{name}.png", cell=max(_CELL, 480))
+    overview = _overview(report)
+    if overview:
+        # A camera may have this name.
+        taken = "overview" in report.capture.cameras
+        _write_sheet(overview, out / ("overview_of_all.png" if taken else "overview.png"))
+
+
+def _overview(report: CaptureReport) -> list[list[tuple[str, np.ndarray]]]:
+    """The frame in the middle, or the nearest that can be read, of every camera; four in a row."""
+    middle = sorted(range(len(report.frames)), key=lambda i: abs(i - len(report.frames) // 2))[:_ROWS]
+    cells = []
+    for name in report.capture.cameras if report.capture is not None else ():
+        shown = next(_overlays(report, name, [report.frames[i] for i in middle]), None)
+        if shown is not None:
+            cells.append((f"{name} {shown[0]}", shown[2]))
+    return [cells[i : i + 4] for i in range(0, len(cells), 4)]
+
+
+def _overlays(report: CaptureReport, name: str, frames: list[str]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """(frame, image, image under its meshes with the outline of its mask) of the frames that can be read."""
     from nbavatar.data.overlays import mesh_over_image
-    from nbavatar.errors import DataError
+
+    assert report.capture is not None
+    camera = report.capture.cameras[name]
+    for frame in frames:
+        try:
+            image = read_rgb(report.capture, camera, frame)
+            mesh = read_mesh(report.capture, frame, report.topology)
+        except DataError:
+            continue
+        label = _outlined(report, name, frame)
+        meshes = {part: (mesh[part], faces) for part, (faces, _) in report.topology.items() if part in mesh}
+        yield frame, image, mesh_over_image(image, camera, meshes, label)
+
+
+def _write_sheet(rows: list[list[tuple[str, np.ndarray]]], path: Path, cell: int = _CELL) -> None:
     from nbavatar.image.overlay import contact_sheet
 
-    capture = report.capture
-    assert capture is not None
-    chosen = [report.frames[i] for i in np.unique(np.linspace(0, len(report.frames) - 1, _ROWS).astype(int))]
-    overview = []
-    for camera in progress(capture.cameras.values(), "overlays"):
-        rows = []
-        for frame in chosen:
-            try:
-                image = read_rgb(capture, camera, frame)
-                mesh = read_mesh(capture, frame, report.topology)
-            except DataError:
-                continue
-            label = _outlined(report.masks.get(camera.name), frame)
-            meshes = {part: (mesh[part], faces) for part, (faces, _) in report.topology.items() if part in mesh}
-            over = mesh_over_image(image, camera, meshes, label)
-            rows.append([(f"{camera.name} {frame}", image), ("meshes, outline of masks", over)])
-        if rows:
-            with atomic_write(out / f"{camera.name}.png") as path:
-                path.write_bytes(encode_png(contact_sheet(rows, cell=max(_CELL, 480)), level=6))
-            overview.append((camera.name, rows[len(rows) // 2][1][1]))
-    if overview:
-        lines = [overview[i : i + 4] for i in range(0, len(overview), 4)]
-        with atomic_write(out / "overview.png") as path:
-            path.write_bytes(encode_png(contact_sheet(lines, cell=_CELL), level=6))
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(encode_png(contact_sheet(rows, cell=cell), level=6))

@@ -3,7 +3,8 @@
 Reads, by --layout,
 
   decaf     ROOT/{train,test}/videos/S/CAM.mp4, segmentations/S/CAM.mp4, cameras/S/cameras.pkl, cutIDs/S.pkl
-  capture   ROOT/cameras.json, images/CAM/, masks/CAM/, alpha/CAM/, splits.json
+  capture   ROOT/cameras.json, images/CAM/, masks/CAM/, alpha/CAM/, splits.json; with --images-only no masks, which
+            `nbavatar masks --capture ROOT` then reads itself
 
 and writes a frame pack (zip of PNGs and manifest.json, see `nbavatar.io.framepack`) at native size, still distorted:
 
@@ -18,13 +19,12 @@ the subject ends the command with one line and no output.
 """
 
 import argparse
-import dataclasses
 
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import IngestConfig
 from nbavatar.data.capture import open_capture
-from nbavatar.data.capture_masks import open_masks
+from nbavatar.data.capture_masks import CameraMasks, open_masks
 from nbavatar.data.decaf import find_subject, read_camera
 from nbavatar.data.frame_plan import manifest_of, plan_capture, plan_decaf
 from nbavatar.data.sources import LAYERS, capture_images, capture_layers, decaf_images
@@ -46,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--subject", required=True, help="subject, such as S2 (for captures: any name, kept in the record)"
     )
     parser.add_argument("--camera", required=True, help="camera id, such as 084")
+    parser.add_argument("--images-only", action="store_true", help="captures: leave masks and alpha out")
     parser.add_argument("--out", required=True, metavar="ZIP", help="frame pack to write")
     add_cfg_argument(parser, IngestConfig)
 
@@ -68,14 +69,12 @@ def main(args: argparse.Namespace) -> None:
         capture = open_capture(args.root, pixel_center=cfg.pixel_center)
         camera, report = capture.camera(args.camera), {}
         plan = plan_capture(capture, **choice)
-        masks = open_masks(capture, camera, plan.frames)
+        masks = CameraMasks(capture.root, camera, None, None)
+        if not args.images_only:
+            masks = open_masks(capture, camera, plan.frames)
+            report["masks"] = masks.summary()
         layers = capture_layers(masks)
         images = capture_images(capture, masks, plan.frames)
-        report["masks"] = {
-            name: dataclasses.asdict(meaning)
-            for name, meaning in (("masks", masks.mask), ("alpha", masks.coverage))
-            if meaning is not None
-        }
         inputs = {name: capture.root / name for name in ("cameras.json", "splits.json")}
     extra = {
         "layout": args.layout,

@@ -1,8 +1,9 @@
 """Head and hand masks of one camera: the person's matte, cut by the posed meshes and cleaned.
 
 Reads a frame pack with `person` (a matte of the whole person, 0..255) or `label` masks, and a mesh sequence (.npz)
-with the same frames; or masks of your own (--supplied, or `supplied` in --cfg): FOLDER/[SUBJECT/]CAMERA/FRAME.png or
-FOLDER/[SUBJECT/]CAMERA.mp4, with labels 0..3 (images only, or video without loss) or mattes of the person.
+with the same frames; or a capture's folders of masks and alpha images (--capture); or masks of your own (--supplied, or
+`supplied` in --cfg): FOLDER/[SUBJECT/]CAMERA/FRAME.png or FOLDER/[SUBJECT/]CAMERA.mp4, with labels 0..3 (images only,
+or video without loss) or mattes of the person.
 
 Writes a frame pack of the same frames, size and camera (still distorted):
 
@@ -24,10 +25,12 @@ from nbavatar.camera.pinhole import Camera
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import MasksConfig
+from nbavatar.data.capture import open_capture
+from nbavatar.data.capture_masks import CameraMasks, open_masks
 from nbavatar.data.masking import MaskNumbers, MaskStatistics, cut_masks
 from nbavatar.data.part_masks import Margins, PartCutter
 from nbavatar.data.sequences import read_sequence
-from nbavatar.data.sources import LAYERS
+from nbavatar.data.sources import LAYERS, capture_layers, frame_masks
 from nbavatar.data.supplied_masks import supplied_masks
 from nbavatar.errors import DataError
 from nbavatar.image.clothes import ClothesModel
@@ -43,7 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--meshes", required=True, metavar="NPZ", help="mesh sequence of `nbavatar tracks` (or fit, deform)"
     )
-    parser.add_argument("--supplied", metavar="DIR", help="masks of your own, instead of those in the frame pack")
+    parser.add_argument(
+        "--capture", metavar="DIR", help="the capture whose masks to take, where the frame pack has none"
+    )
+    parser.add_argument("--supplied", metavar="DIR", help="masks of your own, instead of all others")
     parser.add_argument("--out", required=True, metavar="ZIP", help="frame pack to write")
     add_cfg_argument(parser, MasksConfig)
 
@@ -64,8 +70,14 @@ def main(args: argparse.Namespace) -> None:
         numbers = MaskNumbers(cfg.threshold, cfg.hole_fraction, cfg.island_fraction, cfg.temporal, cfg.soft_alpha)
         statistics = MaskStatistics()
         supplied = args.supplied or cfg.supplied
-        masks, matte = _masks(pack, supplied, manifest["subject"], camera, tuple(sequence.parts))
         extra = {"subject": manifest["subject"], "camera": camera.name, "supplied": bool(supplied)}
+        if args.capture and not supplied:
+            capture = open_capture(args.capture)
+            found = open_masks(capture, capture.camera(camera.name), frames)
+            masks, matte = _capture_masks(found, frames)
+            extra["masks"] = found.summary()
+        else:
+            masks, matte = _masks(pack, supplied, manifest["subject"], camera, tuple(sequence.parts))
         inputs = {"frames": args.frames, "meshes": args.meshes}
         record = run_record("masks", config=to_mapping(cfg), inputs=inputs, extra=extra)
         layers = {name: LAYERS[name] for name in ("label", "alpha")}
@@ -87,6 +99,20 @@ def main(args: argparse.Namespace) -> None:
 
 def _sorts_clothes(cfg: MasksConfig, pack: FramePack) -> bool:
     return cfg.clothes and cfg.keep == "parts" and "rgb" in pack.layers
+
+
+def _capture_masks(
+    masks: CameraMasks, frames: list[str]
+) -> tuple[Iterator[tuple[str, np.ndarray, np.ndarray | None]], bool]:
+    """The same as `_masks`, from a capture's folders."""
+    layers = capture_layers(masks)
+    if layers == ("rgb",):
+        where, fix = masks.root / "masks" / masks.camera.name, "supply masks of your own with --supplied"
+        raise DataError.of(where, expected="a mask (or an alpha image) for each frame", found="none", fix=fix)
+    read = ((frame, frame_masks(masks, frame)) for frame in frames)
+    if "person" in layers:
+        return ((frame, images["person"], None) for frame, images in read), True
+    return ((frame, images["label"], images["alpha"]) for frame, images in read), False
 
 
 def _masks(

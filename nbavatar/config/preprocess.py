@@ -4,7 +4,15 @@ import dataclasses
 
 from nbavatar.config.core import option
 
-__all__ = ["MATTE_THRESHOLD", "CropConfig", "FramesConfig", "IngestConfig", "MasksConfig", "TracksConfig"]
+__all__ = [
+    "MATTE_THRESHOLD",
+    "CheckConfig",
+    "CropConfig",
+    "FramesConfig",
+    "IngestConfig",
+    "MasksConfig",
+    "TracksConfig",
+]
 
 MATTE_THRESHOLD = 127
 """A matte above this is foreground, unless the options of `masks` say otherwise [0..255]."""
@@ -26,6 +34,13 @@ class FramesConfig:
         0.5, "Where the dataset's camera matrices put the centre of pixel (0, 0) [px]: 0.5, or 0 as OpenCV does.",
         choices=(0.0, 0.5),
     )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckConfig:
+    """What is done about the defects of a capture."""
+
+    stop: bool = option(True, "Whether defects stop the run before anything is made of the capture, or are only said.")
 
 
 @dataclasses.dataclass(frozen=True)

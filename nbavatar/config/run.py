@@ -11,7 +11,7 @@ from nbavatar.config.avatar import SpeedConfig, TrainConfig
 from nbavatar.config.core import from_mapping, merge, option, to_mapping
 from nbavatar.config.evaluation import EvaluateConfig, ProtocolConfig, ReportConfig, TableConfig, VideoConfig
 from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, SpectralConfig
-from nbavatar.config.preprocess import CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
+from nbavatar.config.preprocess import CheckConfig, CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
 from nbavatar.errors import ConfigError, did_you_mean
 from nbavatar.names import check_name, check_place
@@ -24,6 +24,7 @@ class Stages:
     """Options of every stage."""
 
     synthesize: SynthesizeConfig = option(SynthesizeConfig, "Synthetic dataset (used where `synthetic` is true).")
+    check: CheckConfig = option(CheckConfig, "Validation of a capture before anything is made of it.")
     ingest: IngestConfig = option(IngestConfig, "Reading of videos or image folders.")
     tracks: TracksConfig = option(TracksConfig, "Reading of parameters, keypoints and meshes.")
     masks: MasksConfig = option(MasksConfig, "Head and hand masks.")

@@ -2,9 +2,9 @@
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,14 +24,21 @@ from nbavatar.data.capture_masks import CameraMasks, open_masks
 from nbavatar.data.capture_poses import PoseJudge, sampled_frames
 from nbavatar.data.mesh_checks import mesh_faults
 from nbavatar.data.sequences import PARTS
+from nbavatar.data.supplied_masks import supplied_masks
 from nbavatar.errors import DataError
 from nbavatar.mesh.topology import mesh_defects
-from nbavatar.mesh.zbuffer import rasterize_mesh
 
-__all__ = ["CaptureReport", "check_capture"]
+__all__ = ["CaptureReport", "Supplied", "check_capture"]
 
 _SIZES = {"head": (0.1, 0.8), "right_hand": (0.05, 0.7), "left_hand": (0.05, 0.7)}  # plausible diagonals [m]
 _MUCH_ASTRAY = 0.15  # share of a mesh's pixels off its part, of which a note is made
+
+
+class Supplied(NamedTuple):
+    """Folder of masks that are used in place of the capture's, or nothing, and whose are taken from there."""
+
+    folder: str
+    subject: str
 
 
 @dataclasses.dataclass
@@ -41,7 +48,9 @@ class CaptureReport:
     Attributes:
         defects: lines that name what has to be mended before the capture can be used.
         notes: lines about what is unusual but usable.
-        overlap: camera -> mean share of the masks that the projected meshes cover.
+        supplied: masks that are used in place of the capture's.
+        overlap: camera -> intersection over union of its masks and the projected meshes, in a few frames.
+        astray: camera -> share of the projected meshes' pixels that are off their part of the masks, in these frames.
         capture: the capture, if its cameras can be read.
         frames: frame ids.
         topology: faces and rest vertices of the parts.
@@ -50,7 +59,9 @@ class CaptureReport:
 
     defects: list[str] = dataclasses.field(default_factory=list)
     notes: list[str] = dataclasses.field(default_factory=list)
+    supplied: Supplied = Supplied("", "")
     overlap: dict[str, float] = dataclasses.field(default_factory=dict)
+    astray: dict[str, float] = dataclasses.field(default_factory=dict)
     capture: Capture | None = None
     frames: list[str] = dataclasses.field(default_factory=list)
     topology: dict[str, tuple[np.ndarray, np.ndarray | None]] = dataclasses.field(default_factory=dict)
@@ -81,24 +92,32 @@ class _Collector:
 
 
 def check_capture(
-    root: str | Path, progress: Callable[[Iterable[str], str], Iterable[str]] = lambda items, _: items
+    root: str | Path,
+    progress: Callable[[Iterable[str], str], Iterable[str]] = lambda items, _: items,
+    *,
+    pixel_center: float = 0.5,
+    supplied: str = "",
+    subject: str = "",
 ) -> CaptureReport:
     """Reads every file of a capture and compares them with each other.
 
     Args:
         root: folder of the capture.
         progress: wraps the loop over the frames of a camera, for a progress bar.
+        pixel_center: where the stored matrices put the centre of pixel (0, 0) [px].
+        supplied: folder of masks that are used in place of the capture's, see `supplied_masks`; empty for none.
+        subject: whose masks are taken from there.
 
     Returns:
         the report; the capture is usable if `defects` is empty.
     """
     root = Path(root)
-    report = CaptureReport()
+    report = CaptureReport(supplied=Supplied(supplied, subject))
     found = _Collector(report.defects)
     if not root.is_dir():
         report.defects.append(f"{root}: expected the folder of a capture, found no such folder")
         return report
-    cameras = found.attempt("cameras", lambda: _cameras(root, found)) or {}
+    cameras = found.attempt("cameras", lambda: _cameras(root, found, pixel_center)) or {}
     splits = found.attempt("splits", lambda: read_splits(root))
     report.topology = found.attempt("topology", lambda: read_topology(root)) or {}
     capture = recentred(root, cameras)
@@ -116,7 +135,7 @@ def check_capture(
     meshes = _check_meshes(capture, report, found) if report.topology and report.frames else {}
     judge = PoseJudge(cameras, report.topology, meshes)
     for camera in cameras.values():
-        _check_camera(capture, camera, report, meshes, found, judge, progress)
+        _check_camera(capture, camera, report, found, judge, progress)
     if meshes:
         _check_poses(root, judge, report, found)
     if len(cameras) == 1:
@@ -126,11 +145,11 @@ def check_capture(
     return report
 
 
-def _cameras(root: Path, found: _Collector) -> dict[str, Camera]:
+def _cameras(root: Path, found: _Collector, pixel_center: float) -> dict[str, Camera]:
     path = root / "cameras.json"
     cameras = {}
     for name, entry in read_rig(path).items():
-        camera = found.attempt(f"camera {name}", lambda: camera_of(name, entry, path))  # noqa: B023
+        camera = found.attempt(f"camera {name}", lambda: camera_of(name, entry, path, pixel_center))  # noqa: B023
         if camera is not None:
             cameras[name] = camera
     return cameras
@@ -179,95 +198,87 @@ def _check_camera(
     capture: Capture,
     camera: Camera,
     report: CaptureReport,
-    meshes: Mapping[str, Mapping[str, np.ndarray]],
     found: _Collector,
     judge: PoseJudge,
     progress: Callable[[Iterable[str], str], Iterable[str]],
 ) -> None:
-    name, overlaps = camera.name, []
-    masks_folder = capture.root / "masks" / name
-    labels: set[int] = set()
-    sampled = set(sampled_frames(report.frames)) if report.frames else set()
-    marked = False
+    name = camera.name
     masks = found.attempt(f"masks {name}", lambda: open_masks(capture, camera, report.frames))
     if masks is not None:
         report.masks[name] = masks
-        if report.frames and masks.mask is None and masks.coverage is None:
-            line = DataError.of(masks_folder, expected="a mask (or an alpha image) for each frame", found="none")
-            found.note(f"no mask {name}", str(line))
         for kind, meaning in (("masks", masks.mask), ("alpha", masks.coverage)):
             if meaning is not None and meaning.white not in (0, 255, 65535):
                 where = capture.root / kind / name
                 report.notes.append(f"{where}: a matte in which {meaning.white} is full coverage")
     for frame in progress(report.frames, f"check {name}"):
         found.attempt(f"images {name}", lambda: read_rgb(capture, camera, frame))  # noqa: B023
-        if masks is None:
-            continue
-        mask, alpha = masks.read_mask(frame), masks.read_coverage(frame)
-        labelled = masks.mask is not None and masks.mask.kind == "label"
-        shown = mask if mask is not None else alpha
-        if shown is not None:
-            person = shown if labelled else (shown > MATTE_THRESHOLD).astype(np.uint8)
-            marked = marked or bool(person.any())
-            if frame in sampled:
-                judge.add(name, frame, person, labelled=labelled)
-        if mask is None:
-            continue
-        if masks.mask is not None and masks.mask.kind == "label":
+    if report.supplied.folder:
+        folder, parts = Path(report.supplied.folder), tuple(report.topology)
+        own = found.attempt(
+            f"supplied {name}", lambda: supplied_masks(folder, report.supplied.subject, camera, report.frames, parts)
+        )
+        if own is not None:
+            shown = zip(report.frames, own[0])
+            _check_masks(folder / name, camera, shown, own[1].kind == "label", report, found, judge)
+    elif masks is not None and (masks.mask is not None or masks.coverage is not None):
+        labelled, there = masks.mask is not None and masks.mask.kind == "label", masks.mask is not None
+        shown = ((frame, masks.read_mask(frame) if there else masks.read_coverage(frame)) for frame in report.frames)
+        _check_masks(capture.root / "masks" / name, camera, shown, labelled, report, found, judge)
+    elif masks is not None and report.frames:
+        where = capture.root / "masks" / name
+        line = DataError.of(where, expected="a mask (or an alpha image) for each frame", found="none")
+        found.note(f"no mask {name}", str(line))
+
+
+def _check_masks(
+    folder: Path,
+    camera: Camera,
+    masks: Iterable[tuple[str, np.ndarray | None]],
+    labelled: bool,
+    report: CaptureReport,
+    found: _Collector,
+    judge: PoseJudge,
+) -> None:
+    """Looks at (frame, mask) of one camera: labels 0..3, or mattes of the person."""
+    sampled, empty, labels, count = set(sampled_frames(report.frames)), [], set(), 0
+    for frame, mask in masks:
+        assert mask is not None
+        person = mask if labelled else (mask > MATTE_THRESHOLD).astype(np.uint8)
+        count += 1
+        if not person.any():
+            empty.append(frame)
+        if labelled:
             labels |= set(np.unique(mask).tolist())
-            there = mask > 0
-        else:
-            there = mask > MATTE_THRESHOLD
-        if not there.any():
-            report.notes.append(f"{masks_folder / frame}: the mask is empty")
-        elif frame in meshes:
-            overlaps.append(_overlap(camera, report.topology, meshes[frame], there))
-    if report.frames and not marked and masks is not None and (masks.mask or masks.coverage):
+        if frame in sampled:
+            judge.add(camera.name, frame, person, labelled=labelled)
+    if count and len(empty) == count:
         line = DataError.of(
-            masks_folder, expected="labelled pixels in a frame at least", found="none in any",
+            folder, expected="labelled pixels in a frame at least", found=f"none in {count}",
             fix="mend the masks, or leave this camera out of cameras.json",
         )  # fmt: skip
-        found.note(f"nothing {name}", str(line))
+        found.note(f"nothing {camera.name}", str(line))
+    elif empty:
+        more = f" (and {len(empty) - 1} more frames)" if len(empty) > 1 else ""
+        report.notes.append(f"{folder / empty[0]}: the mask is empty{more}")
     for value in sorted(labels - {0}):
         part = PARTS[value - 1]
         if report.topology and part not in report.topology:
-            where = capture.root / "meshes" / "topology.npz"
+            where = report.capture.root / "meshes" / "topology.npz" if report.capture else folder
             line = DataError.of(where, f"{part}_faces", expected=f"a mesh for label {value} of the masks", found="none")
             found.note(f"label {value}", str(line))
-    if overlaps:
-        report.overlap[name] = float(np.mean(overlaps))
 
 
 def _check_poses(root: Path, judge: PoseJudge, report: CaptureReport, found: _Collector) -> None:
     path = root / "cameras.json"
     lines = judge.defects(path)
+    report.overlap, report.astray = judge.overlaps(), judge.misfits()
     for number, line in enumerate(lines):
         found.note(f"poses {number}", line)
-    for name, astray in judge.misfits().items() if not lines else ():
+    for name, astray in report.astray.items() if not lines else ():
         if astray > _MUCH_ASTRAY:
             report.notes.append(
                 f"{path}: camera {name}: {astray:.0%} of the meshes' pixels are off their part of the masks"
             )
-
-
-def _overlap(
-    camera: Camera,
-    topology: Mapping[str, tuple[np.ndarray, np.ndarray | None]],
-    mesh: Mapping[str, np.ndarray],
-    mask: np.ndarray,
-) -> float:
-    """Intersection over union of mask (bool `[H, W]`) and mesh silhouette, at a quarter of the resolution."""
-    step = max(1, max(camera.width, camera.height) // 256)
-    K = camera.K.copy()
-    K[:2] /= step
-    small = mask[step // 2 :: step, step // 2 :: step]
-    height, width = small.shape
-    covered = np.zeros_like(small)
-    for part, (faces, _) in topology.items():
-        if part not in mesh:
-            continue
-        covered |= rasterize_mesh(mesh[part], faces, K, width, height, cam_from_world=camera.cam_from_world)[0] >= 0
-    return float((covered & small).sum() / max((covered | small).sum(), 1))
 
 
 def _note_on_order(root: Path, frames: list[str], report: CaptureReport) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,11 @@ class CameraMasks:
     def read_coverage(self, frame: str) -> np.ndarray | None:
         """Coverage 0..255, uint8 `[H, W]`; None where there are no alpha images."""
         return self._read("alpha", frame, self.coverage)
+
+    def summary(self) -> dict[str, Any]:
+        """What they mean, for the record of a stage."""
+        found = {"masks": self.mask, "alpha": self.coverage}
+        return {name: dataclasses.asdict(meaning) for name, meaning in found.items() if meaning is not None}
 
     def _read(self, kind: str, frame: str, meaning: Meaning | None) -> np.ndarray | None:
         if meaning is None:

@@ -42,10 +42,11 @@ class _View:
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """Share of the meshes' pixels off their part, and share of the mask that meshes cover."""
+    """Share of the meshes' pixels off their part, share of the mask that meshes cover, intersection over union."""
 
     misfit: float
     covered: float
+    overlap: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +144,10 @@ class PoseJudge:
     def misfits(self) -> dict[str, float]:
         """Camera -> misfit from 0 to 1, mean over its frames; cameras without a mask are left out."""
         return {name: fit.misfit for name, fit in self._fits().items()}
+
+    def overlaps(self) -> dict[str, float]:
+        """Camera -> intersection over union of meshes and masks, mean over its frames."""
+        return {name: fit.overlap for name, fit in self._fits().items()}
 
     def defects(self, path: object) -> list[str]:
         """One line for each thing that is wrong; none if meshes and masks agree.
@@ -243,10 +248,13 @@ class PoseJudge:
         face, _, _ = rasterize_mesh(points, faces, K, width, height)
         drawn = face >= 0
         if not drawn.any():
-            return _Fit(1.0, 0.0)
+            return _Fit(1.0, 0.0, 0.0)
         agree = (view.mask == part[face]) if view.labelled else (view.mask > 0)
-        covered = float((drawn & (view.mask > 0)).sum() / (view.mask > 0).sum())
-        return _Fit(float(1.0 - (agree & drawn).sum() / drawn.sum() * min(1.0, covered / _LEAST_COVERED)), covered)
+        there = view.mask > 0
+        both = float((drawn & there).sum())
+        covered = both / there.sum()
+        met = (agree & drawn).sum() / drawn.sum() * min(1.0, covered / _LEAST_COVERED)
+        return _Fit(float(1.0 - met), float(covered), float(both / (drawn | there).sum()))
 
     @staticmethod
     def _step(camera: Camera) -> int:
@@ -254,7 +262,7 @@ class PoseJudge:
 
 
 def _mean(fits: Iterable[_Fit]) -> _Fit:
-    values = [(fit.misfit, fit.covered) for fit in fits]
+    values = [dataclasses.astuple(fit) for fit in fits]
     return _Fit(*np.mean(values, axis=0).tolist())
 
 

@@ -15,7 +15,7 @@ from nbavatar.errors import DataError
 from nbavatar.image.clean import spread_labels
 from nbavatar.io.video import probe_video, read_video
 
-__all__ = ["LAYERS", "capture_images", "capture_layers", "decaf_images"]
+__all__ = ["LAYERS", "capture_images", "capture_layers", "decaf_images", "frame_masks"]
 
 LAYERS = {
     "rgb": "colour, sRGB, uint8",
@@ -73,20 +73,24 @@ def capture_images(
     and the label is 0 (hair, soft edges) the label is taken from the nearest labelled pixel, so that every covered
     pixel belongs to a part.
     """
-    layers = capture_layers(masks)
     for frame in frames:
-        images = {"rgb": read_rgb(capture, masks.camera, frame)}
-        if "person" in layers:
-            person = masks.read_coverage(frame) if masks.mask is None else masks.read_mask(frame)
-            assert person is not None
-            images["person"] = person
-        if "label" in layers:
-            label, alpha = masks.read_mask(frame), masks.read_coverage(frame)
-            assert label is not None
-            if alpha is None:
-                alpha = np.where(label > 0, np.uint8(255), np.uint8(0))
-            images["label"], images["alpha"] = _agree(label, alpha)
-        yield frame, images
+        yield frame, {"rgb": read_rgb(capture, masks.camera, frame), **frame_masks(masks, frame)}
+
+
+def frame_masks(masks: CameraMasks, frame: str) -> dict[str, np.ndarray]:
+    """The layers of `capture_layers` but rgb, of one frame."""
+    layers, images = capture_layers(masks), {}
+    if "person" in layers:
+        person = masks.read_coverage(frame) if masks.mask is None else masks.read_mask(frame)
+        assert person is not None
+        images["person"] = person
+    if "label" in layers:
+        label, alpha = masks.read_mask(frame), masks.read_coverage(frame)
+        assert label is not None
+        if alpha is None:
+            alpha = np.where(label > 0, np.uint8(255), np.uint8(0))
+        images["label"], images["alpha"] = _agree(label, alpha)
+    return images
 
 
 def _agree(label: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

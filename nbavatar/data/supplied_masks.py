@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from nbavatar.camera.pinhole import Camera
+from nbavatar.config.inputs import supplied_place
 from nbavatar.data.mask_values import LABELS, Meaning, ValueSurvey, spread
 from nbavatar.data.pictures import find_picture, list_pictures
 from nbavatar.errors import DataError
@@ -13,8 +14,6 @@ from nbavatar.io.pictures import Plane, read_plane
 from nbavatar.io.video import probe_video, read_video
 
 __all__ = ["supplied_masks"]
-
-_VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 
 
 def supplied_masks(
@@ -51,14 +50,11 @@ def supplied_masks(
 
 def _find(base: Path, subject: str, camera: str) -> Path:
     """The folder or video that holds a camera's masks."""
-    for place in (base / subject, base):
-        if (place / camera).is_dir():
-            return place / camera
-        for suffix in _VIDEOS:
-            if (place / f"{camera}{suffix}").is_file():
-                return place / f"{camera}{suffix}"
-    expected = f"{subject}/{camera}/<frame>.png, {camera}/<frame>.png or such videos"
-    raise DataError.of(base, expected=expected, found="none of them")
+    place = supplied_place(str(base), subject, camera)
+    if place is None:
+        expected = f"{subject}/{camera}/<frame>.png, {camera}/<frame>.png or such videos"
+        raise DataError.of(base, expected=expected, found="none of them")
+    return place
 
 
 def _from_images(folder: Path, frames: Sequence[str], camera: Camera) -> Iterator[tuple[Path, Plane]]:

@@ -23,6 +23,9 @@ while [ $# -gt 0 ]; do
     "extremes --out") for f in table.md table.csv heatmap.png curves.png record.json; do make "$2/$f"; done ;;
     "video --out") make "$2"; make "$2.json" ;;
     "tradeoff --sheet") ;;
+    "check --overview"|"check --record")
+      if [ -e defect ]; then echo "cameras.json: a defect" >&2; exit 2; fi
+      make "$2" ;;
     "deform --table") make "$2" ;;
     *" --out"|*" --csv"|*" --sheet"|*" --exr"|*" --picture"|*" --history"|*" --validate") make "$2" ;;
     "figure --out-stem") for s in png pdf json; do make "$2.$s"; done ;;

@@ -1,12 +1,16 @@
 """The re-run contract: which edit re-runs what. Commands are stubs; only plans are compared."""
 
+import os
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 import yaml
 
 from nbavatar.config.sheets import read_subjects
+from tests.scenes.capture import write_capture
+from tests.workflow.conftest import Project
 
 ROOT = Path(__file__).parents[2]
 
@@ -152,3 +156,180 @@ def test_a_lost_result_is_made_again_with_what_follows(finished):
     plan = finished.plan()
     path.write_text(kept)
     assert plan["evaluate"] == 1 and "train" not in plan
+
+
+# A capture: 3 cameras, of which c1 is held out.
+CHECKED = {"check": 1, "check_sheet": 1}
+JUDGED = {"render": 2, "evaluate": 2, "speed": 1, "table": 3, "report": 1, "figure": 4, "video": 2}
+TRAINED = {"train": 1, **JUDGED}
+HELD_OUT = {"render": 1, "evaluate": 1, "table": 1, "figure": 2, "report": 1}
+
+
+class Capture:
+    """A capture, and the project in which everything has been made of it."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self.project = Project(folder / "p")
+        self.root = write_capture(folder / "toy")
+        self.words = ["--config", f"data_root={self.root}", *words]
+        self.run()
+        assert self.plan() == {}
+
+    def run(self) -> None:
+        done = self.project.snakemake("--quiet", "all", *self.words, config="config/capture.yaml")
+        assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
+
+    def plan(self, *configs: str) -> dict[str, int]:
+        return self.project.plan(*self.words, config=" ".join(["config/capture.yaml", *configs]))
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    return Capture(tmp_path_factory.mktemp("captured"))
+
+
+@pytest.fixture
+def change(captured):
+    """Changes a folder of the capture, plans, and puts it back with its times."""
+    kept = captured.root.with_name("kept")
+
+    def apply(edit, *configs):
+        os.rename(captured.root, kept)
+        shutil.copytree(kept, captured.root)  # times stay, but not those of renamings
+        edit(captured.root)
+        return captured.plan(*configs)
+
+    yield apply
+    shutil.rmtree(captured.root)
+    os.rename(kept, captured.root)
+
+
+def _edited(name):
+    """In place, with the same size: only the time tells."""
+
+    def edit(root):
+        path = root / name
+        with path.open("r+b") as stream:
+            first = stream.read(1)
+            stream.seek(0)
+            stream.write(first)
+        os.utime(path, ns=(0, path.stat().st_mtime_ns + 1_000_000))
+
+    return edit
+
+
+def _replaced(name):
+    """By a rename, as editors save."""
+
+    def edit(root):
+        new = root / "new"
+        new.write_bytes((root / name).read_bytes() + b"more")
+        os.replace(new, root / name)
+
+    return edit
+
+
+def _exchanged(folder, first, second):
+    """Two files of one size and one time, as archives leave them, exchanged by renaming."""
+
+    def edit(root):
+        a, b, c = (root / folder / name for name in (first, second, "other"))
+        os.rename(a, c)
+        os.rename(b, a)
+        os.rename(c, b)
+
+    return edit
+
+
+def _added(name):
+    def edit(root):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"new")
+
+    return edit
+
+
+MASKED = {**CHECKED, "masks": 1, "crop": 1}
+SEEN = {**CHECKED, "ingest": 1, "masks": 1, "crop": 1}
+MOVED = {**CHECKED, "tracks": 1, "masks": 3, "crop": 3, "align": 1, "spectral": 1, **TRAINED}
+EDITS = {
+    "nothing but a copy": (lambda root: None, {}),
+    "a mask": (_edited("masks/c0/f1.png"), MASKED | TRAINED),
+    "a mask of the held-out camera": (_edited("masks/c1/f1.png"), MASKED | HELD_OUT),
+    "a mask replaced": (_replaced("masks/c2/f3.png"), MASKED | TRAINED),
+    "a mask removed": (lambda root: (root / "masks/c0/f2.png").unlink(), MASKED | TRAINED),
+    "coverage added": (_added("alpha/c0/f0.png"), MASKED | TRAINED),
+    "an image": (_edited("images/c0/f1.png"), SEEN | {"align": 1, "spectral": 1} | TRAINED),
+    "an image of the held-out camera": (_edited("images/c1/f0.png"), SEEN | HELD_OUT),
+    "an image renamed": (
+        lambda root: (root / "images/c2/f0.png").rename(root / "images/c2/f0.PNG"),
+        SEEN | {"align": 1, "spectral": 1} | TRAINED,
+    ),
+    "a mesh": (_edited("meshes/f2.npz"), MOVED),
+    "a mesh replaced": (_replaced("meshes/f0.npz"), MOVED),
+    "the topology": (_edited("meshes/topology.npz"), MOVED),
+    "what is no frame": (_added("masks/c0/notes.txt"), {}),
+    "a frame that splits.json leaves out": (_added("images/c0/f9.png"), {}),
+    "a hidden file": (_added("meshes/.f0.npz.swp"), {}),
+}
+
+
+@pytest.mark.parametrize("case", EDITS)
+def test_files_of_a_capture_run_what_depends_on_them(change, case):
+    edit, expected = EDITS[case]
+    assert change(edit) == expected
+
+
+def test_files_that_exchange_their_names_are_seen(captured):
+    pair = [captured.root / "masks/c0" / name for name in ("f0.png", "f1.png")]
+    kept = [(path, path.read_bytes(), path.stat().st_mtime_ns) for path in pair]
+    for path in pair:
+        path.write_bytes(b"1234" + path.name.encode())
+        os.utime(path, ns=(0, 10**18))
+    captured.run()
+    assert captured.plan() == {}
+    _exchanged("masks/c0", "f0.png", "f1.png")(captured.root)
+    assert captured.plan() == MASKED | TRAINED
+    for path, content, time in kept:
+        path.write_bytes(content)
+        os.utime(path, ns=(0, time))
+    captured.run()
+
+
+def test_options_that_change_with_a_file_are_not_forgotten(captured, change):
+    """Snakemake looks for no other change behind a job that has to run: the check must not be such a job."""
+    (captured.project.folder / "seed.json").write_text('{"stages": {"train": {"seed": 7}}}')
+    plan = change(_edited("masks/c1/f1.png"), "seed.json")
+    assert plan == MASKED | TRAINED
+
+
+def test_a_check_that_fails_stops_and_leaves_what_was_made(captured):
+    defect = captured.project.folder / "defect"
+    path = captured.root / "masks/c1/f1.png"
+    before = path.stat().st_mtime_ns
+    os.utime(path, ns=(0, before + 1))
+    defect.touch()
+    done = captured.project.snakemake(*captured.words, config="config/capture.yaml")
+    text = done.stdout + done.stderr
+    assert done.returncode != 0 and "cameras.json: a defect" in text
+    assert "rule check:" in text and not re.search(r"rule (masks|ingest|train|evaluate):", text)
+    defect.unlink()
+    os.utime(path, ns=(0, before))
+    assert captured.plan() == {}
+
+
+def test_supplied_masks_run_what_depends_on_them(tmp_path):
+    own = tmp_path / "own"
+    for name in ("toy/c0/f0.png", "toy/c1/f0.png", "c2/f0.png"):
+        _added(name)(own)
+    words = [f"stages={{masks: {{supplied: {own}}}}}"]
+    capture = Capture(tmp_path, *words)
+    for name, expected in (("toy/c0/f1.png", TRAINED), ("toy/c1/f0.png", HELD_OUT), ("c2/f0.png", TRAINED)):
+        (own / name).write_bytes(b"mended")
+        assert capture.plan() == MASKED | expected, name
+        capture.run()
+    (own / "toy/c2.mp4").write_bytes(b"film")  # comes before c2/
+    assert capture.plan() == MASKED | TRAINED
+    _edited("masks/c0/f0.png")(capture.root)
+    _added("c0/f0.png")(own)
+    assert capture.plan() == MASKED | TRAINED

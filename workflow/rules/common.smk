@@ -11,6 +11,12 @@ from types import SimpleNamespace
 from snakemake.exceptions import WorkflowError
 
 from nbavatar.config.figures import read_figures
+from nbavatar.config.inputs import (
+    files_digest,
+    mesh_digest,
+    rig_digest,
+    supplied_digest,
+)
 from nbavatar.config.run import load_run, stage_options
 from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
 from nbavatar.config.tables import read_tables
@@ -161,7 +167,7 @@ def raw_files(wildcards):
     subject, camera = wildcards.subject, wildcards.camera
     if RUN.layout == "capture":
         base = Path(SUBJECTS[subject].root)
-        return [base / "cameras.json", base / "splits.json", base / "images" / camera]
+        return [base / "cameras.json", base / "splits.json"]
     base = split_folder(subject)
     return [
         base / "videos" / subject / f"{camera}.mp4",
@@ -171,12 +177,63 @@ def raw_files(wildcards):
     ]
 
 
+def checked(wildcards):
+    """What has to be there, however old, before anything is made of a capture."""
+    if RUN.layout != "capture":
+        return []
+    return [ancient(f"{R}/check/{wildcards.subject}/record.json")]
+
+
+def looked_at(subjects):
+    """Pictures of captures that have been checked as they are now."""
+    if RUN.layout != "capture":
+        return []
+    return [f"{R}/check/{subject}/overview.png" for subject in subjects]
+
+
+# The folders of a capture hold too many files to be inputs one by one, and the times of folders do not tell of files
+# that were changed in place. Their digests are parameters.
+def files_of_images(wildcards):
+    """Digest of the images of one camera of a capture."""
+    if RUN.layout != "capture":
+        return ""
+    return files_digest(root(wildcards), wildcards.camera, ["images"])
+
+
+def files_of_masks(wildcards):
+    """Digest of one camera's masks, of a capture or supplied by the user."""
+    supplied = RUN.stages.masks.supplied
+    if supplied:
+        return supplied_digest(supplied, wildcards.subject, wildcards.camera)
+    if RUN.layout != "capture":
+        return ""
+    return files_digest(root(wildcards), wildcards.camera, ["masks", "alpha"])
+
+
+def files_of_meshes(wildcards):
+    """Digest of the meshes of a capture."""
+    return mesh_digest(root(wildcards)) if RUN.layout == "capture" else ""
+
+
+def files_of_capture(wildcards):
+    """Digests of all files of a capture that `check` reads."""
+    folder, supplied = root(wildcards), RUN.stages.masks.supplied
+    found = [
+        rig_digest(folder),
+        mesh_digest(folder),
+    ]
+    for camera in cameras(wildcards):
+        found.append(files_digest(folder, camera, ["images", "masks", "alpha"]))
+        found.append(supplied_digest(supplied, wildcards.subject, camera))
+    return found
+
+
 def raw_tracks(wildcards):
     """Files of the dataset that a subject's parameters and meshes come from."""
     subject = wildcards.subject
     if RUN.layout == "capture":
         base = Path(SUBJECTS[subject].root)
-        return [base / "cameras.json", base / "splits.json", base / "meshes"]
+        return [base / "cameras.json", base / "splits.json"]
     base = split_folder(subject)
     cameras = SUBJECTS[subject].cameras
     keyed = ("head_keys", "right_hand_keys", "head_bbs", "right_hand_bbs")
@@ -306,10 +363,11 @@ def report_pictures():
     )
     if RUN.layout == "capture" and RUN.stages.tracks.contact == "given":
         stages = ("spectral",)
-    return [f"{R}/figures/{figure}.png" for figure in FIGURES] + [
-        f"{R}/{stage}/{s}.png"
-        for stage in stages
-        for s in dict.fromkeys(row.subject for row in ROWS)
+    subjects = list(dict.fromkeys(row.subject for row in ROWS))
+    return [
+        *(f"{R}/figures/{figure}.png" for figure in FIGURES),
+        *looked_at(subjects),
+        *(f"{R}/{stage}/{subject}.png" for stage in stages for subject in subjects),
     ]
 
 

@@ -1,7 +1,8 @@
 """Raw data -> frame packs and mesh sequences.
 
 REQUIRED INPUTS: the dataset at `data_root` (made by `synthesize` where the configuration says `synthetic: true`).
-OUTPUTS: results/{run}/ingest/{subject}/{camera}.zip, results/{run}/tracks/{subject}.npz
+OUTPUTS: results/{run}/check/{subject}/{record.json,overview.png} of captures,
+         results/{run}/ingest/{subject}/{camera}.zip, results/{run}/tracks/{subject}.npz
 """
 
 if RUN.synthetic:
@@ -33,9 +34,61 @@ if RUN.synthetic:
             "nbavatar synthesize --out {params.root:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
+# A capture is looked at as a whole before time is spent on it: what is made of it waits for the record, but is not made
+# again because a capture has been checked again. What `check` depends on is therefore no input or parameter of it
+# (Snakemake would then not look for other changes behind it), but of `check_sheet`, which asks for a picture that only
+# a new check makes. That the record stays when a check fails leaves what follows as it is, too.
+if RUN.layout == "capture":
+
+    rule check:
+        output:
+            record=update("results/{run}/check/{subject}/record.json"),
+            picture=temp("results/{run}/check/{subject}/checked.png"),
+        log:
+            "logs/{run}/check/{subject}.log",
+        priority: 20
+        resources:
+            mem="8GB",
+            runtime="4h",
+            root=root,
+            supplied=f"--supplied={RUN.stages.masks.supplied}",
+            center=f"--pixel-center={RUN.frames.pixel_center}",
+            cfg=options("check"),
+        shell:
+            "nbavatar check {resources.root:q} --subject {wildcards.subject:q} {resources.supplied:q}"
+            " {resources.center:q} --overview {output.picture:q} --record {output.record:q}"
+            " --cfg {resources.cfg:q} > {log:q} 2>&1"
+
+    rule check_sheet:
+        input:
+            "results/{run}/check/{subject}/checked.png",
+        output:
+            report(
+                "results/{run}/check/{subject}/overview.png",
+                category="Inputs",
+                labels={"stage": "check", "subject": "{subject}"},
+                caption="../report/check.rst",
+            ),
+        log:
+            "logs/{run}/check_sheet/{subject}.log",
+        resources:
+            mem="1GB",
+            runtime="10m",
+        params:
+            root=root,
+            supplied=RUN.stages.masks.supplied,
+            center=RUN.frames.pixel_center,
+            files=files_of_capture,
+            cfg=options("check"),
+            code=code_digest("check"),
+        shell:
+            "cp {input:q} {output:q} > {log:q} 2>&1"
+
+
 rule ingest:
     input:
         raw_files,
+        checked,
     output:
         "results/{run}/ingest/{subject}/{camera}.zip",
     log:
@@ -46,16 +99,19 @@ rule ingest:
     params:
         root=root,
         layout=RUN.layout,
+        files=files_of_images,
+        only="--images-only" if RUN.layout == "capture" else "",
         cfg=options("ingest"),
         code=code_digest("ingest"),
     shell:
         "nbavatar ingest --layout {params.layout:q} --root {params.root:q} --subject {wildcards.subject:q}"
-        " --camera {wildcards.camera:q} --out {output:q} --cfg {params.cfg:q} > {log:q} 2>&1"
+        " --camera {wildcards.camera:q} {params.only:q} --out {output:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 rule tracks:
     input:
         raw_tracks,
+        checked,
     output:
         "results/{run}/tracks/{subject}.npz",
     log:
@@ -67,6 +123,7 @@ rule tracks:
         root=root,
         layout=RUN.layout,
         cameras=cameras,
+        files=files_of_meshes,
         cfg=options("tracks"),
         code=code_digest("tracks"),
     shell:

@@ -7,6 +7,7 @@ OUTPUTS: results/{run}/masks/{subject}/{camera}.zip, results/{run}/crop/{crop}/{
 
 rule masks:
     input:
+        checked,
         frames="results/{run}/ingest/{subject}/{camera}.zip",
         meshes="results/{run}/tracks/{subject}.npz",
     output:
@@ -17,10 +18,12 @@ rule masks:
         mem="8GB",
         runtime="4h",
     params:
+        files=files_of_masks,
+        capture=lambda w: ["--capture", root(w)] if RUN.layout == "capture" else [],
         cfg=options("masks"),
         code=code_digest("masks"),
     shell:
-        "nbavatar masks --frames {input.frames:q} --meshes {input.meshes:q} --out {output:q}"
+        "nbavatar masks --frames {input.frames:q} --meshes {input.meshes:q} {params.capture:q} --out {output:q}"
         " --cfg {params.cfg:q} > {log:q} 2>&1"
 
 

@@ -25,6 +25,8 @@ def stage_files(stage):
     }
     if RUN.layout == "decaf":
         files["fit"] = [f"{R}/fit/{s}.npz" for s in subjects]
+    if RUN.layout == "capture":
+        files["check"] = looked_at(subjects)
     if ALIGNED:
         files["align"] = [f"{R}/align/{s}.npz" for s in subjects]
     return files[stage]
@@ -37,6 +39,7 @@ for _subject in SUBJECTS:
             f"subject_{_subject}"
         input:
             evals_of([row for row in ROWS if row.subject == _subject]),
+            looked_at([_subject]),
 
 
 for _table in TABLES:
@@ -46,9 +49,11 @@ for _table in TABLES:
             f"table_{_table}"
         input:
             [f"{R}/tables/{_table}.{suffix}" for suffix in ("csv", "md", "tex")],
+            looked_at(SUBJECTS),
 
 
 for _stage in (
+    *(["check"] if RUN.layout == "capture" else []),
     "ingest",
     "tracks",
     "masks",
@@ -69,3 +74,4 @@ for _stage in (
             f"stage_{_stage}"
         input:
             stage_files(_stage),
+            looked_at(SUBJECTS),
