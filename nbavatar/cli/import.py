@@ -20,7 +20,6 @@ PART head, right_hand, left_hand; .ply too; the same faces in all frames, in the
 """
 
 import argparse
-import math
 from pathlib import Path
 
 from nbavatar.cli.common import progress
@@ -124,7 +123,7 @@ def _folder(text: str | None) -> Path | None:
 
 def _positive(text: str) -> float:
     value = float(text)
-    if not 0 < value < math.inf:
+    if not 1e-12 < value < 1e12:
         raise argparse.ArgumentTypeError(f"expected a number above 0, found {text}")
     return value
 

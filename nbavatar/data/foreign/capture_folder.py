@@ -64,6 +64,10 @@ def write_capture(
     entries = {}
     for camera in cameras:
         lens = one_lens(source, camera, [shots[camera, frame] for frame in frames], moving=moving)
+        if not (np.isfinite(lens.K).all() and np.isfinite(_scaled(lens, scale)).all()):
+            raise DataError.of(
+                source.path, f"camera {camera}", expected="finite numbers", found="others, after scaling"
+            )
         entries[called[0][camera]] = _entry(lens, scale, moving)
     if moving and source.meshes is None:
         raise DataError.of(

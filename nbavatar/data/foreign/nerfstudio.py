@@ -69,7 +69,7 @@ def _original(top: Mapping[str, Any], path: Path) -> Any:
     if top.get("applied_transform") is not None:
         try:
             stored = np.array(top["applied_transform"], dtype=np.float64)
-            transform[:3] = stored[:3]
+            transform[:3] = stored[:3] if stored.ndim == 2 else np.nan
         except (TypeError, ValueError):
             transform[:] = np.nan
         off = float(np.abs(transform[:3, :3] @ transform[:3, :3].T - np.eye(3)).max())
@@ -80,7 +80,7 @@ def _original(top: Mapping[str, Any], path: Path) -> Any:
             )  # fmt: skip
     if top.get("applied_scale") is not None:
         scale = top["applied_scale"]
-        if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 0 < scale < 1e12:
+        if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 1e-12 < scale < 1e12:
             raise DataError.of(path, "applied_scale", expected="a number above 0", found=repr(scale)[:60])
 
     def undo(lens: Lens) -> Lens:

@@ -112,7 +112,7 @@ def _distortion(values: Mapping[str, Any], where: str) -> np.ndarray | None:
     model = values.get("camera_model", "OPENCV")
     if values.get("is_fisheye"):
         model = "OPENCV_FISHEYE"
-    if model not in _MODELS:
+    if not isinstance(model, str) or model not in _MODELS:
         raise DataError.of(
             where, "camera_model", expected=f"one of {', '.join(_MODELS)}", found=repr(model)[:40],
             fix="undistort the pictures to a pinhole camera first",

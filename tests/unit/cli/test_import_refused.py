@@ -46,6 +46,9 @@ BAD_NERFSTUDIO = {
     "no picture": (first(file_path="images/none"), "expected a picture"),
     "fisheye": (lambda top: top.update(camera_model="OPENCV_FISHEYE"), "camera_model: expected one of"),
     "instant-ngp's fisheye": (lambda top: top.update(is_fisheye=True), "found 'OPENCV_FISHEYE'"),
+    "model of another type": (lambda top: top.update(camera_model={}), "camera_model: expected one of"),
+    "transform of another shape": (lambda top: top.update(applied_transform=3.5), "applied_transform: expected 3 x 4"),
+    "transform of a row": (lambda top: top.update(applied_transform=[1, 2, 3, 4]), "applied_transform: expected 3 x 4"),
     "fourth coefficient": (lambda top: top.update(camera_model="OPENCV", k4=0.1), "k4: expected k1, k2, k3, p1, p2"),
     "lens of a pinhole": (lambda top: top.update(k1=0.1), "k1: expected no coefficients, as PINHOLE has"),
     "size": (lambda top: top.update(w=64), "w, h: expected 56 x 48 as its picture, found 64 x 48"),
@@ -64,6 +67,7 @@ BAD_NERFSTUDIO = {
     ),
     "twice": (lambda top: top["frames"].append(top["frames"][0]), "expected one picture, found"),
     "transform": (lambda top: top.update(applied_transform=[[1, 0], [2, 2]]), "applied_transform: expected 3 x 4"),
+    "scale that is all but nothing": (lambda top: top.update(applied_scale=1e-320), "applied_scale: expected a number"),
     "scale": (lambda top: top.update(applied_scale=0), "applied_scale: expected a number above 0"),
 }
 
