@@ -10,6 +10,7 @@ With --json the same as one JSON object:
   machine      processors, memory_gb, disk_free_gb, gpus [names]
   kernel       null, or why no kernel can be compiled and run
   packages     module -> version, or null with the reason in `broken`
+  needs        module -> verbs whose code imports it, in part or as a whole
   limited      module -> what is missing on this system, where only a part of one verb needs the package
   verbs        verb -> modules that are missing
   weights      lpips net -> file, or null
@@ -127,6 +128,7 @@ def examine(root: Path) -> dict[str, Any]:
         "machine": _machine(),
         "kernel": _kernel_problem(),
         "limited": limited,
+        "needs": {name: [verb for verb, modules in needed.items() if name in modules] for name in packages},
         "packages": packages,
         "broken": broken,
         "verbs": verbs,
@@ -228,7 +230,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         "packages   " + ", ".join(f"{name} {v}" for name, v in found["packages"].items() if v is not None),
     ]
     for name, reason in found["broken"].items():
-        verbs = ", ".join(verb for verb, names in found["verbs"].items() if name in names) or _OPTIONAL.get(name, "")
+        verbs = _OPTIONAL.get(name) or ", ".join(found["needs"][name])
         package = distribution_of(name)
         if name in found["limited"]:
             lines.append(f"limited    {package}: {reason}; needed for {_PARTIAL[name]} only; {remedy(name)}")
