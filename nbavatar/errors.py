@@ -29,14 +29,19 @@ __all__ = [
 ]
 
 
+_LONGEST = 1000  # characters of a line
+
+
 class NBAvatarError(Exception):
     """Base of all errors whose cause lies outside the program.
 
-    Names and values in the text come from files; what a terminal would obey instead of showing is written out.
+    Names and values in the text come from files: what a terminal would obey instead of showing is written out, and
+    lines beyond all measure are cut in the middle.
     """
 
     def __init__(self, text: str = "") -> None:
-        super().__init__("".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text))
+        lines = (line if len(line) <= _LONGEST else f"{line[:600]} ... {line[-300:]}" for line in text.split("\n"))
+        super().__init__("\n".join("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line) for line in lines))
 
     @classmethod
     def of(cls, where: object, field: str = "", *, expected: object, found: object, fix: str = "") -> Self:
@@ -166,7 +171,10 @@ def require(module: str, package: str, why: str) -> ModuleType:
 
 def describe(value: Any) -> str:
     """Short text of a value for error lines; a value that refers to its parts many times over stays short too."""
-    text = _REPR.repr(value)
+    try:
+        text = _REPR.repr(value)
+    except (ValueError, RecursionError):  # a whole number of thousands of digits, for one
+        text = f"a {type(value).__name__} that cannot be shown"
     return text if len(text) <= 80 else text[:77] + "..."
 
 

@@ -196,7 +196,7 @@ def _array(content: Mapping[str, Any], key: str, where: str, shape: tuple[int | 
         value = value.toarray()
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DataError.of(where, key, expected="an array of numbers", found=type(value).__name__) from None
     _check_shape(array.shape, shape, where, key)
     if not np.isfinite(array).all():

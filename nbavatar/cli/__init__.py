@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 
 from nbavatar import __version__
-from nbavatar.errors import NBAvatarError, did_you_mean
+from nbavatar.errors import NBAvatarError, describe, did_you_mean
 from nbavatar.packages import distribution_of, install_line
 
 __all__ = ["SOCKET_VARIABLE", "VERBS", "main"]
@@ -58,6 +58,10 @@ SOCKET_VARIABLE = "NBAVATAR_WARM"
 _WITH_TORCH = frozenset({"train", "render", "evaluate", "speed", "tradeoff", "extremes", "video", "figure"})
 
 
+# Errors of the system that only a defect of ours explains; all others are about the user's files, disks and limits.
+_OURS = (errno.EBADF, errno.EFAULT, errno.ENOTSOCK)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one verb; returns the exit code (0 done, 2 bad input or usage, 130 interrupted)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -98,11 +102,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         module_name = error.name.partition(".")[0]
         message = f"package '{distribution_of(module_name)}' is not installed; run: {install_line(module_name)}"
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.ENOENT, errno.ENOTDIR):
+        if error.errno is None or error.errno in _OURS:
             raise
-        message = f"{error.filename or 'file system'}: {error.strerror}"
+        message = f"{_place(error)}: {error.strerror}"
+    except MemoryError as error:
+        message = f"out of memory: {error or 'the data are too large for this machine'}"
     print(f"nbavatar {verb}: error: {message}", file=sys.stderr)
     return 2
+
+
+def _place(error: OSError) -> str:
+    """The file that an error of the system is about, in one line."""
+    if error.filename is None:
+        return "file system"
+    name = os.fsdecode(error.filename) if isinstance(error.filename, (str, bytes)) else str(error.filename)
+    return describe(name) if len(name) > 200 or not name.isprintable() else name
 
 
 def _top_parser() -> argparse.ArgumentParser:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from nbavatar.config.core import from_mapping
-from nbavatar.errors import ConfigError
+from nbavatar.config.yamlfiles import read_yaml
+from nbavatar.errors import ConfigError, parsing
 
 __all__ = ["add_cfg_argument", "progress", "read_mapping", "stage_config", "training_preset"]
 
@@ -36,21 +37,16 @@ def read_mapping(text: str, option: str) -> dict[str, Any]:
     where = option
     if not text.lstrip().startswith("{"):
         path, where = Path(text), f"{option} {text}"
-        if not path.is_file():
-            raise ConfigError.of(where, expected="JSON text or a file", found="neither")
-        text = path.read_text(encoding="utf-8")
+        with parsing(option, "JSON text or a file", error=ConfigError):
+            if not path.is_file():
+                raise ConfigError.of(where, expected="JSON text or a file", found="neither")
         if path.suffix in (".yaml", ".yml"):
-            import yaml
-
-            try:
-                value = yaml.safe_load(text)
-            except yaml.YAMLError as error:
-                raise ConfigError.of(where, expected="YAML", found=f"text that does not parse ({error})") from error
-            return _mapping(value, where)
-    try:
-        return _mapping(json.loads(text), where)
-    except json.JSONDecodeError as error:
-        raise ConfigError.of(where, expected="JSON", found=f"text that does not parse ({error})") from error
+            return _mapping(read_yaml(path, "YAML"), where)
+        with parsing(where, "JSON", damaged="text that does not parse", error=ConfigError):
+            text = path.read_text(encoding="utf-8-sig")
+    with parsing(where, "JSON", damaged="text that does not parse", error=ConfigError):
+        value = json.loads(text)
+    return _mapping(value, where)
 
 
 def progress(items: Iterable[Item], description: str, total: int | None = None) -> Iterable[Item]:

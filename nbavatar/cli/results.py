@@ -41,6 +41,13 @@ _EVALUATION = {
     "train_cameras?": (None, [str]),
     "record?": (None, _RECORD),
 }
+# What the caption of a table says beside the numbers.
+_CAPTIONED = _EVALUATION | {
+    "protocol": {"name": str, "split": str, "crop": str, "background": (Ellipsis, 3, float), "precision": str},
+    "size": _SIZE,
+    "count": int,
+    "frames": str,
+}
 _TIMING = {
     "speed": {
         "ms": {str: (float, None)},
@@ -100,7 +107,7 @@ def read_result(path: str) -> dict[str, Any]:
     content = read_json(path)
     if not isinstance(content, dict) or not {"metrics", "speed"} & set(content):
         raise DataError.of(path, expected="a result of nbavatar evaluate or speed", found="another JSON file")
-    check_form(content, _EVALUATION | {"size": _SIZE} if "metrics" in content else _TIMING, path)
+    check_form(content, _CAPTIONED if "metrics" in content else _TIMING, path)
     return content
 
 

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from nbavatar.errors import ConfigError
+from nbavatar.errors import ConfigError, DataError
 from nbavatar.provenance import file_digest
 
 __all__ = ["add_preset_arguments", "timed_device", "tuned_avatar"]
@@ -69,6 +69,9 @@ def tuned_avatar(
         chosen = preset_setting(path, name, model=digest, device=here)
     else:
         chosen = budget_setting(path, model=digest, device=here, size=size, max_ms=max_ms, min_psnr=min_psnr)
+    if chosen.importance is not None and len(chosen.importance) != len(avatar.faces):
+        expected, found = f"{len(avatar.faces)} numbers, one a billboard of {args.model}", len(chosen.importance)
+        raise DataError.of(path, "importance", expected=expected, found=found)
     print(chosen.why, flush=True)
     importance = None if chosen.importance is None else torch.tensor(chosen.importance)[None]
     described = {"preset": name or None, "setting": to_mapping(chosen.setting), "why": chosen.why}

@@ -136,6 +136,8 @@ def _read(hint: Any, value: Any, metadata: Mapping[str, Any], where: str) -> Any
     if origin is dict:
         if not isinstance(value, Mapping):
             raise ConfigError.of(where, expected="a mapping", found=describe(value))
+        if None in value:
+            raise ConfigError.of(where, expected="a name before every ':'", found="an empty key")
         return {str(k): _read(args[1], v, metadata, f"{where}.{k}") for k, v in value.items()}
     if hint is not Any:
         value = _check_scalar(hint, value, where)

@@ -2,10 +2,10 @@
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TypeVar
 
 from nbavatar.config.core import from_mapping
+from nbavatar.config.yamlfiles import read_yaml
 from nbavatar.errors import ConfigError, did_you_mean
 from nbavatar.names import check_name
 
@@ -25,14 +25,7 @@ def read_layouts(path: str | os.PathLike[str], cls: type[T], kind: str) -> dict[
     Raises:
         ConfigError: no such file, not YAML, an unknown key, a wrong type.
     """
-    import yaml
-
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError.of(path, expected=f"the layout of the {kind}s (.yaml)", found="no such file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError.of(path, expected="YAML", found=f"text that does not parse ({error})") from error
+    content = read_yaml(path, f"the layout of the {kind}s (.yaml)")
     if not isinstance(content, dict):
         raise ConfigError.of(path, expected=f"{kind} name -> layout", found=type(content).__name__)
     named = {check_name(str(name), path, kind, error=ConfigError): value for name, value in content.items()}

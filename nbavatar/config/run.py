@@ -13,6 +13,7 @@ from nbavatar.config.evaluation import EvaluateConfig, ProtocolConfig, ReportCon
 from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, SpectralConfig
 from nbavatar.config.preprocess import CheckConfig, CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
+from nbavatar.config.yamlfiles import check_tree
 from nbavatar.errors import ConfigError, did_you_mean
 from nbavatar.names import check_name, check_place
 
@@ -118,6 +119,7 @@ def load_run(mapping: Mapping[str, Any], where: str = "config") -> RunConfig:
     Raises:
         ConfigError: an unknown key, a wrong type, a value out of range, a crop or stage that does not exist.
     """
+    check_tree(mapping, where)
     run = from_mapping(RunConfig, mapping, where)
     check_name(run.run, f"{where}.run", error=ConfigError)
     for key in ("data_root", "tables", "reported", "figures"):

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from nbavatar.config.cameras import choose_camera, parse_camera, read_rig, stored_test_camera
-from nbavatar.errors import ConfigError, DataError, did_you_mean
+from nbavatar.errors import ConfigError, DataError, did_you_mean, parsing
 from nbavatar.names import check_name, check_place, name_like
 
 __all__ = ["Row", "Subject", "capture_subjects", "read_rows", "read_subjects"]
@@ -130,17 +130,16 @@ def read_rows(path: str | os.PathLike[str], subjects: Sequence[str]) -> list[Row
 
 
 def _read(path: str | os.PathLike[str], columns: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
-    try:
+    with parsing(path, "a sheet (.tsv)", damaged="text that does not parse", error=ConfigError):
         with open(path, newline="", encoding="utf-8-sig") as stream:
             lines = [line for line in stream if not line.startswith("#")]
-    except FileNotFoundError as error:
-        raise ConfigError.of(path, expected="a sheet (.tsv)", found="no such file") from error
-    reader = csv.DictReader(lines, delimiter="\t")
+        reader = csv.DictReader(lines, delimiter="\t")
+        rows = list(enumerate(reader, start=2))
     if list(reader.fieldnames or ()) != list(columns):
         found = ", ".join(reader.fieldnames or ()) or "nothing"
         raise ConfigError.of(path, "header", expected=f"tab-separated {', '.join(columns)}", found=found)
     result = []
-    for number, row in enumerate(reader, start=2):
+    for number, row in rows:
         if None in row or any(value is None for value in row.values()):
             raise ConfigError.of(f"{path}, line {number}", expected=f"{len(columns)} columns", found="another number")
         result.append((number, {key: value.strip() for key, value in row.items()}))

@@ -21,7 +21,8 @@ import numpy as np
 
 from nbavatar.camera.distortion import checked_coefficients
 from nbavatar.camera.pinhole import Camera
-from nbavatar.errors import DataError, did_you_mean
+from nbavatar.errors import DataError, describe, did_you_mean, parsing
+from nbavatar.io.arrays import read_array_header
 from nbavatar.io.pickles import read_array, read_pickle
 from nbavatar.io.video import probe_video
 from nbavatar.names import check_name
@@ -155,7 +156,8 @@ def read_camera(subject: DecafSubject, camera: str, *, pixel_center: float = 0.5
     stored = read_pickle(path)
     if not isinstance(stored, Mapping):
         raise DataError.of(path, expected="a mapping of cameras", found=type(stored).__name__)
-    by_name = {_camera_id(key): value for key, value in stored.items()}
+    with parsing(path, "a mapping of cameras", damaged="one with other keys"):
+        by_name = {_camera_id(key): value for key, value in stored.items()}
     if camera not in by_name:
         raise DataError(f"{path}: no camera '{camera}'; {did_you_mean(camera, by_name)}")
     if camera not in subject.cameras:
@@ -176,7 +178,8 @@ def read_camera(subject: DecafSubject, camera: str, *, pixel_center: float = 0.5
     if off > 1e-3 or np.linalg.det(pose[:3, :3]) < 0:
         found = f"one that is off by {off:.2g}, determinant {np.linalg.det(pose[:3, :3]):.3g}"
         raise DataError.of(where, "extrinsic", expected="a rotation", found=found)
-    key, coefficients = _distortion(entry, where)
+    with parsing(where, "distortion coefficients", damaged="something else"):
+        key, coefficients = _distortion(entry, where)
     info = probe_video(subject.file("videos", f"{camera}.mp4"))
     shift = 0.5 - pixel_center
     K[0, 2] += shift
@@ -206,8 +209,8 @@ def read_parameters(subject: DecafSubject) -> dict[str, dict[str, np.ndarray]]:
     for key, value in stored.items():
         try:
             number = int(key)
-        except (TypeError, ValueError):
-            raise DataError.of(path, "frame key", expected="a frame number", found=repr(key)) from None
+        except (TypeError, ValueError, OverflowError):
+            raise DataError.of(path, "frame key", expected="a frame number", found=describe(key)) from None
         if number in numbers:
             raise DataError.of(path, f"frame {number}", expected="each frame once", found="it twice")
         numbers[number] = value
@@ -221,7 +224,8 @@ def read_parameters(subject: DecafSubject) -> dict[str, dict[str, np.ndarray]]:
                 raise DataError.of(
                     f"{path}: frame {number}", f"{part}.{name}", expected=f"{size} values", found=len(row)
                 )
-        values = np.stack(rows).astype(np.float32)
+        with np.errstate(over="ignore"):
+            values = np.stack(rows).astype(np.float32)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(bad):
             found = "NaN" if np.isnan(values[bad[0]]).any() else "infinity"
@@ -233,7 +237,9 @@ def read_parameters(subject: DecafSubject) -> dict[str, dict[str, np.ndarray]]:
 
 def read_keypoints(subject: DecafSubject, part: str, camera: str) -> np.ndarray:
     """Reads landmarks of `head` or `right_hand`, float32 `[N, 68 | 21, 3]`; undetected ones get confidence 0."""
-    points = read_frame_array(subject.file(f"{part}_keys", f"{camera}.npy"), (KEYPOINTS[part], 3)).astype(np.float32)
+    stored = read_frame_array(subject.file(f"{part}_keys", f"{camera}.npy"), (KEYPOINTS[part], 3))
+    with np.errstate(over="ignore"):
+        points = stored.astype(np.float32)
     lost = ~np.isfinite(points).all(axis=-1) | (points[..., :2] < 0).all(axis=-1)
     points[lost] = 0.0
     return points
@@ -245,9 +251,10 @@ def read_boxes(subject: DecafSubject, part: str, camera: str, width: int, height
     A failed detection is stored as -1; such rows, and boxes that are empty or leave the frame, become NaN. They must
     not be taken for the whole frame, which would blow up any crop made from them.
     """
-    boxes = read_frame_array(subject.file(f"{part}_bbs", f"{camera}.npy"), (4,)).astype(np.float32)
-    x0, y0, x1, y1 = boxes.T
-    with np.errstate(invalid="ignore"):
+    stored = read_frame_array(subject.file(f"{part}_bbs", f"{camera}.npy"), (4,))
+    with np.errstate(invalid="ignore", over="ignore"):
+        boxes = stored.astype(np.float32)
+        x0, y0, x1, y1 = boxes.T
         good = (x0 >= 0) & (y0 >= 0) & (x1 <= width) & (y1 <= height) & (x1 > x0) & (y1 > y0)
     boxes[~good] = np.nan
     return boxes
@@ -257,11 +264,11 @@ def read_cuts(subject: DecafSubject) -> list[tuple[int, int]]:
     """Reads pairs (last frame before a cut, first frame after it); often there is none."""
     stored = read_pickle(subject.cut_file)
     pairs = stored.tolist() if isinstance(stored, np.ndarray) else stored
-    if not isinstance(pairs, (list, tuple)) or not all(isinstance(p, (list, tuple, np.ndarray)) for p in pairs):
-        raise DataError.of(subject.cut_file, expected="a list of pairs of frame numbers", found=repr(stored)[:60])
-    if not all(len(p) == 2 for p in pairs):
-        raise DataError.of(subject.cut_file, expected="pairs of frame numbers", found=repr(stored)[:60])
-    return [(int(a), int(b)) for a, b in pairs]
+    whole = isinstance(pairs, (list, tuple)) and all(isinstance(p, (list, tuple, np.ndarray)) for p in pairs)
+    if not whole or not all(len(p) == 2 for p in pairs):
+        raise DataError.of(subject.cut_file, expected="a list of pairs of frame numbers", found=describe(stored))
+    with parsing(subject.cut_file, "pairs of frame numbers", damaged="something else"):
+        return [(int(a), int(b)) for a, b in pairs]
 
 
 def read_frame_array(path: Path, shape: Sequence[int | None]) -> np.ndarray:
@@ -320,13 +327,8 @@ def check_counts(counts: Mapping[Path, int]) -> int:
 
 
 def _header_rows(path: Path) -> int:
-    with open(path, "rb") as stream:
-        try:
-            version = np.lib.format.read_magic(stream)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape = read(stream)[0]
-        except (ValueError, EOFError) as error:
-            raise DataError.of(path, expected="a numpy .npy file", found=str(error).splitlines()[0]) from None
+    with parsing(path, "a numpy .npy file"), open(path, "rb") as stream:
+        shape, _, _ = read_array_header(stream)
     return int(shape[0]) if shape else 0
 
 
@@ -342,8 +344,8 @@ def _matrix(entry: Mapping[Any, Any], name: str, shapes: Sequence[tuple[int, int
         raise DataError.of(where, name, expected=f"a {wanted} matrix", found=f"only {', '.join(map(str, entry))}")
     try:
         matrix = np.array(entry[name], dtype=np.float64)
-    except (TypeError, ValueError):
-        raise DataError.of(where, name, expected=f"a {wanted} matrix", found=repr(entry[name])[:60]) from None
+    except (TypeError, ValueError, OverflowError):
+        raise DataError.of(where, name, expected=f"a {wanted} matrix", found=describe(entry[name])) from None
     if matrix.shape not in shapes or not np.isfinite(matrix).all():
         found = list(matrix.shape) if matrix.shape not in shapes else "one with NaN or infinity"
         raise DataError.of(where, name, expected=f"a finite {wanted} matrix", found=found)
@@ -364,5 +366,5 @@ def _parameter(frame: Any, part: str, name: str, where: str) -> np.ndarray:
         raise DataError.of(where, f"{part}.{name}", expected="a vector", found="none")
     try:
         return np.asarray(frame[part][name], dtype=np.float64).reshape(-1)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DataError.of(where, f"{part}.{name}", expected="a vector of numbers", found="something else") from None

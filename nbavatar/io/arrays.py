@@ -15,9 +15,10 @@ from nbavatar.io.archives import open_archive
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.records import canonical_json
 
-__all__ = ["read_array_header", "read_arrays", "read_plain_array", "write_arrays"]
+__all__ = ["check_text", "read_array_header", "read_arrays", "read_plain_array", "write_arrays"]
 
 _RECORD = "record.json"
+_LAST_CHARACTER = 0x10FFFF
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -93,5 +94,20 @@ def read_plain_array(stream: IO[bytes], size: int) -> np.ndarray:
     claimed, there = prod(shape) * dtype.itemsize, size - stream.tell()
     if claimed != there or min(shape, default=0) < 0:
         raise ValueError(f"shape {shape} of {dtype} in {there} bytes")
+    if dtype.names is not None:
+        raise ValueError("an array of records")
     stream.seek(0)
-    return np.lib.format.read_array(stream, allow_pickle=False)
+    return check_text(np.lib.format.read_array(stream, allow_pickle=False))
+
+
+def check_text(array: np.ndarray) -> np.ndarray:
+    """The same array, if its text is made of characters: numpy takes any numbers, and Python breaks on them later.
+
+    Raises:
+        ValueError: an array of text with numbers beyond the last character of Unicode.
+    """
+    if array.dtype.kind == "U" and array.size and array.dtype.itemsize:
+        codes = np.ascontiguousarray(array).reshape(-1).view(array.dtype.byteorder.replace("|", "=") + "u4")
+        if codes.max() > _LAST_CHARACTER:
+            raise ValueError("text with numbers that are no characters")
+    return array

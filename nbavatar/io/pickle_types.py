@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from nbavatar.errors import describe
+from nbavatar.io.arrays import check_text
 from nbavatar.io.unpickler import Budget, Function, Refused, Shim, checked_key, describe_class
 
 __all__ = ["ALLOWED"]
@@ -139,7 +140,7 @@ class _Array(Shim):
         if not dtype.hasobject:
             raw = _raw(content)
             budget.take(len(raw))
-            return np.frombuffer(raw, dtype=dtype).reshape(shape, order=order).copy(order="K")
+            return check_text(np.frombuffer(raw, dtype=dtype)).reshape(shape, order=order).copy(order="K")
         if not isinstance(content, list):
             raise ValueError("an array of objects without a list")
         budget.take(8 * len(content))
@@ -177,7 +178,7 @@ def _scalar(dtype: Any, content: Any = b"") -> Any:
         raise Refused("numpy scalar of object type")
     if not isinstance(content, (str, bytes)) or len(content) != kind.itemsize:
         raise ValueError("a numpy scalar of the wrong length")
-    return np.frombuffer(_raw(content), dtype=kind)[0]
+    return check_text(np.frombuffer(_raw(content), dtype=kind))[0]
 
 
 class _FromBuffer(Shim):
@@ -200,7 +201,7 @@ class _FromBuffer(Shim):
             raise ValueError(f"a buffer that is a {type(raw).__name__}")
         budget.take(len(raw))
         order, shape = self.state["order"], tuple(int(n) for n in self.state["shape"])
-        flat = np.frombuffer(bytearray(raw), dtype=_dtype(self.state["dtype"]))
+        flat = check_text(np.frombuffer(bytearray(raw), dtype=_dtype(self.state["dtype"])))
         return flat.reshape(shape, order="F" if order == "F" else "C")
 
 

@@ -30,11 +30,11 @@ def describe_protocol(panel: Panel, results: Sequence[tuple[Mapping[str, Any], S
     for digest, group in sorted(by_hash.items()):
         protocol = group[0]["protocol"]
         sizes = sorted({tuple(result["size"]) for result in group})
-        colour = protocol["background"]
+        colour, split = protocol["background"], _SPLITS.get(protocol["split"], protocol["split"])
         ground = "white" if min(colour) == 1 else "black" if max(colour) == 0 else str(colour)
         frames = sorted({f"{r['subject']} {r['count']} images, frames {r['frames']}" for r in group})
         sentences.append(
-            f"Protocol {protocol['name']} ({digest}): {_SPLITS[protocol['split']]}, crop {protocol['crop']}, "
+            f"Protocol {protocol['name']} ({digest}): {split}, crop {protocol['crop']}, "
             f"{', '.join(f'{w} x {h}' for w, h in sizes)} px, {ground} background, {protocol['precision']}; "
             f"LPIPS by {_NETS[lpips_net]}{remark}; {'; '.join(frames)}."
         )
@@ -48,7 +48,7 @@ def _describe_trivial(results: Sequence[Mapping[str, Any]]) -> str:
     by_subject: dict[str, str] = {}
     for result in results:
         values = [
-            f"{names[answer]} {metrics['psnr']:.2f}"
+            f"{names.get(answer, answer)} {metrics['psnr']:.2f}"
             for answer, metrics in (result.get("trivial") or {}).items()
             if metrics.get("psnr") is not None
         ]

@@ -102,7 +102,7 @@ def deviating_marks(
     """
     columns: dict[str, dict[str, Printed]] = {}
     for (name, row, column), cell in cells.items():
-        if name == table:
+        if name == table and column.rpartition(".")[2] in _HIGHER_IS_BETTER:
             columns.setdefault(column, {})[row] = cell
     found = []
     for column, by_row in columns.items():

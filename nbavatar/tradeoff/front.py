@@ -8,8 +8,34 @@ from typing import Any
 from nbavatar.config.core import from_mapping, to_mapping
 from nbavatar.config.tradeoff import LimitConfig, SettingConfig
 from nbavatar.errors import DataError
+from nbavatar.io.forms import check_form
 
-__all__ = ["Point", "choose_preset", "describe", "losses", "pareto_front", "pick_in_budget", "steadied", "within"]
+__all__ = [
+    "POINT_FORM",
+    "Point",
+    "choose_preset",
+    "describe",
+    "losses",
+    "pareto_front",
+    "pick_in_budget",
+    "steadied",
+    "within",
+]
+
+
+POINT_FORM = {
+    "model": str,
+    "label": str,
+    "setting": dict,
+    "values": {
+        "psnr": float,
+        "lpips": float,
+        "speedup": float,
+        "ms": {"total": float},
+        "steady_ms?": float,
+    },
+}
+"""What `Point.to_mapping` gives, as far as others rely on it (`nbavatar.io.forms`)."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +71,9 @@ class Point:
     @staticmethod
     def of(mapping: Mapping[str, Any], where: str) -> "Point":
         """The point that `to_mapping` described; DataError where it is none."""
-        try:
-            setting = from_mapping(SettingConfig, mapping["setting"], f"{where}, setting")
-            return Point(str(mapping["model"]), str(mapping["label"]), setting, mapping["values"])
-        except (KeyError, TypeError) as error:
-            raise DataError.of(where, expected="a measured point", found=f"one without {error}") from error
+        check_form(mapping, POINT_FORM, where)
+        setting = from_mapping(SettingConfig, mapping["setting"], f"{where}, setting")
+        return Point(mapping["model"], mapping["label"], setting, mapping["values"])
 
 
 def describe(setting: SettingConfig, exact: SettingConfig) -> str:

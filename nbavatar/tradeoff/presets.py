@@ -13,13 +13,26 @@ from typing import Any, NamedTuple
 from nbavatar.config.core import from_mapping, to_mapping
 from nbavatar.config.tradeoff import ACCURATE, LimitConfig, SettingConfig
 from nbavatar.errors import DataError, did_you_mean
+from nbavatar.io.forms import check_form
 from nbavatar.io.records import read_json, write_json
-from nbavatar.tradeoff.front import Point, losses, pick_in_budget
+from nbavatar.tradeoff.front import POINT_FORM, Point, losses, pick_in_budget
 
 __all__ = ["Chosen", "budget_setting", "preset_entry", "preset_setting", "presets_path", "store_presets"]
 
 FORMAT = 1
 _KIND = "nbavatar presets"
+_FORM = {
+    "model": str,
+    "measured": [
+        {
+            "device": str,
+            "size": (Ellipsis, 2, int),
+            "presets": {str: {"setting": dict, "label": str, "why": str}},
+            "points": [POINT_FORM],
+            "importance": (None, [float]),
+        }
+    ],
+}
 
 
 class Chosen(NamedTuple):
@@ -84,6 +97,7 @@ def store_presets(
     if Path(path).is_file():
         stored = read_json(path)
         if isinstance(stored, dict) and stored.get("kind") == _KIND and stored.get("model") == model:
+            check_form(stored, _FORM, path)
             measured = [e for e in stored["measured"] if (e["device"], e["size"]) != (device, list(size))]
     entry = {
         "device": device,
@@ -165,6 +179,7 @@ def _read(path: str | os.PathLike[str], model: str | None) -> list[dict[str, Any
     content = read_json(path)
     if not isinstance(content, dict) or content.get("kind") != _KIND or content.get("format") != FORMAT:
         raise DataError.of(path, "kind", expected=f"'{_KIND}', format {FORMAT}", found="something else")
+    check_form(content, _FORM, path)
     if model is not None and content["model"] != model:
         raise DataError.of(
             path, "model", expected=f"the model that is rendered ({model[:19]})", found=content["model"][:19],

@@ -37,16 +37,16 @@ class PointLog:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = Path(path)
         self._lines: dict[str, dict[str, Any]] = {}
-        text = self._path.read_text(encoding="utf-8") if self._path.is_file() else ""
-        whole = text[: text.rfind("\n") + 1]
-        if whole != text:
-            with open(self._path, "r+", encoding="utf-8") as stream:
-                stream.truncate(len(whole.encode()))
+        content = self._path.read_bytes() if self._path.is_file() else b""
+        whole = content[: content.rfind(b"\n") + 1]
+        if whole != content:
+            with open(self._path, "r+b") as stream:
+                stream.truncate(len(whole))
         for line in whole.splitlines():
             try:
                 entry = json.loads(line)
                 self._lines[entry["key"]] = entry
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, RecursionError):
                 continue  # measured again
 
     def get(self, key: str) -> dict[str, Any] | None:

@@ -10,6 +10,7 @@
 A folder whose key differs belongs to another experiment; it is moved aside, never mixed and never deleted.
 """
 
+import contextlib
 import json
 import os
 import time
@@ -73,7 +74,7 @@ class RunFolder:
     def _belongs(key_file: Path, key: Mapping[str, Any]) -> bool:
         try:
             return canonical_json(json.loads(key_file.read_text(encoding="utf-8"))) == canonical_json(dict(key))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             # A folder without a readable key that holds nothing yet was cut off while it was being made.
             return not (key_file.parent / "state.pt").exists()
 
@@ -86,7 +87,7 @@ class RunFolder:
         state = read_tensors(file, "a training state", fix=f"delete {self.path}")
         with parsing(file, "a training state", fix=f"delete {self.path}"):
             step = int(state["step"])
-        self._rewrite_events([event for event in self.events() if event.get("step", 0) <= step])
+        self._rewrite_events([event for event in self.events() if event["step"] <= step])
         self._first = step + 1
         return state
 
@@ -105,16 +106,17 @@ class RunFolder:
         self._event_file().scalars(event["step"], numbers)
 
     def events(self) -> list[dict[str, Any]]:
-        """All whole lines of the events; one that was cut off by a crash is skipped."""
+        """All whole lines of the events; one that was cut off by a crash, or damaged, is skipped."""
         file = self.path / "events.jsonl"
         if not file.exists():
             return []
         events = []
         for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
-            try:
-                events.append(json.loads(line))
-            except ValueError:
-                continue
+            with contextlib.suppress(ValueError, RecursionError):
+                event = json.loads(line)
+                canonical_json(event).encode()  # refuses NaN, infinity and half characters, which no logged line has
+                if isinstance(event, dict) and isinstance(event.get("step"), int):
+                    events.append(event)
         return events
 
     def preview(self, step: int, image: np.ndarray) -> None:
