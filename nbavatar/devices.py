@@ -45,7 +45,7 @@ def lease_device(wanted: str = "auto", *, patience_s: float = 24 * 3600.0) -> It
     if wanted not in ("auto", "cpu", "cuda"):
         raise DeviceError.of("device", expected="auto, cpu or cuda", found=repr(wanted))
     assigned = os.environ.get("CUDA_VISIBLE_DEVICES")
-    gpus = [] if wanted == "cpu" or assigned == "" else list_gpus()
+    gpus = [] if wanted == "cpu" or _hidden(assigned) else list_gpus()
     if not gpus:
         if wanted == "cuda":
             fix = "use --device cpu or device: cpu"
@@ -91,6 +91,11 @@ def peak_memory_mb(device: str) -> float:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def _hidden(assigned: str | None) -> bool:
+    """Whether `CUDA_VISIBLE_DEVICES` hides all GPUs: CUDA stops at the first name that names none, such as -1."""
+    return assigned is not None and assigned.split(",")[0].strip().lower() in ("", "-1", "nodevfiles", "none", "void")
 
 
 @contextlib.contextmanager

@@ -64,7 +64,7 @@ def _entries(value: Any, where: object, known: dict[int, int | None]) -> int:
     total = 1
     for key, item in value.items() if isinstance(value, Mapping) else ((0, item) for item in value):
         if key is None:
-            fix = "a line begins with ':', or a name was forgotten before one"
+            fix = "a name was forgotten, or is null or ~; write it in quotes if it is meant"
             raise ConfigError.of(where, expected="a name before every ':'", found="an empty key", fix=fix)
         total += _entries(item, where, known)
     if total > _MAX_ENTRIES:

@@ -28,7 +28,8 @@ class Reader:
         write: makes the good file in a folder (with whatever belongs beside it); its path.
         read: reads and uses it.
         kind: how it is damaged (`tests.fuzz.mutations`).
-        refuses: whether damage is refused; the key of a training that is another one moves its folder aside.
+        refuses: whether damage is refused; damaged lines of a log are skipped, and the key of a training that is
+            another one moves its folder aside.
     """
 
     write: Callable[[Path], Path]
@@ -347,7 +348,7 @@ READERS = {
     "model.pt, GaussianAvatars": Reader(lambda d: seeds.avatar(d, "gaussian_avatars"), _avatar, "zip"),
     "model.pt, SplattingAvatar": Reader(lambda d: seeds.avatar(d, "splatting_avatar"), _avatar, "zip"),
     "state.pt": Reader(seeds.state, _state, "zip"),
-    "events.jsonl of a training": Reader(lambda d: seeds.state(d).with_name("events.jsonl"), _state, "json"),
+    "events.jsonl of a training": Reader(lambda d: seeds.state(d).with_name("events.jsonl"), _state, "json", False),
     "key.json of a training": Reader(lambda d: seeds.state(d).with_name("key.json"), _state, "json", False),
     **{f"pickle, protocol {p}": Reader(lambda d, p=p: seeds.pickled(d, p), _pickle, "bytes") for p in (0, 2, 4, 5)},
     "array.npy": Reader(seeds.npy, _array, "bytes"),

@@ -35,8 +35,11 @@ def test_cpu_is_given_when_asked_for_or_when_there_is_nothing_else(monkeypatch):
             assert device == "cpu"
 
 
-def test_cuda_without_a_gpu_is_refused_not_replaced(monkeypatch, two):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+@pytest.mark.parametrize("hidden", ["", "-1", " -1 ", "-1,0", "NoDevFiles"])
+def test_cuda_without_a_gpu_is_refused_not_replaced(monkeypatch, two, hidden):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)
+    with devices.lease_device("auto") as device:
+        assert device == "cpu"
     with pytest.raises(DeviceError, match="expected a CUDA device, found none"), devices.lease_device("cuda"):
         pass
     monkeypatch.setattr(devices, "list_gpus", list)

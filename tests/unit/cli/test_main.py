@@ -50,9 +50,16 @@ def test_version():
     [
         (DataError("x.npz: expected a, found b"), "nbavatar doctor: error: x.npz: expected a, found b"),
         (OSError(28, "No space left on device", "out.zip"), "nbavatar doctor: error: out.zip: No space left on device"),
+        (OSError(27, "File too large", "model.pt"), "nbavatar doctor: error: model.pt: File too large"),
+        (OSError(36, "File name too long", "n" * 300), "nbavatar doctor: error: 'nnnnn"),
+        (OSError(37, "No locks available", "/net/lock"), "nbavatar doctor: error: /net/lock: No locks available"),
+        (OSError(5, "Input/output error"), "nbavatar doctor: error: file system: Input/output error"),
+        (IsADirectoryError(21, "Is a directory", b"a\xff\x1b"), "nbavatar doctor: error: 'a"),
+        (MemoryError("Unable to allocate 9 GiB"), "nbavatar doctor: error: out of memory: Unable to allocate 9 GiB"),
+        (DataError("a\x1b]0;b\x07 " + "c" * 5000), "nbavatar doctor: error: a\\x1b]0;b\\x07 ccc"),
         (
             ModuleNotFoundError("No module named 'igl'", name="igl"),
-            "nbavatar doctor: error: package 'igl' is not installed",
+            "nbavatar doctor: error: package 'libigl' is not installed",
         ),
     ],
 )
@@ -66,15 +73,16 @@ def test_errors_of_the_outside_end_in_one_line(monkeypatch, capsys, error, line)
     assert cli.main(["doctor"]) == 2
     printed = capsys.readouterr().err.strip()
     assert printed.startswith(line)
-    assert "\n" not in printed
+    assert "\n" not in printed and "\x1b" not in printed and len(printed) < 1100
 
 
-def test_defects_of_ours_keep_their_traceback(monkeypatch):
+@pytest.mark.parametrize("defect", [KeyError("ours"), OSError(9, "Bad file descriptor"), OSError("no number")])
+def test_defects_of_ours_keep_their_traceback(monkeypatch, defect):
     import nbavatar.cli.doctor as doctor
 
     def fail(_):
-        raise KeyError("ours")
+        raise defect
 
     monkeypatch.setattr(doctor, "main", fail)
-    with pytest.raises(KeyError):
+    with pytest.raises(type(defect)):
         cli.main(["doctor"])

@@ -80,6 +80,14 @@ def test_frames_reach_both_readers():
         assert (options["max_frames"], options["every"]) == (7, 2)
 
 
+# What YAML makes of `&a {full: *a}`, and of a ladder of lists that hold the one before twice.
+_ENDLESS: dict = {}
+_ENDLESS["full"] = _ENDLESS
+_MANY: list = [1, 2]
+for _ in range(40):
+    _MANY = [_MANY, _MANY]
+
+
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -90,6 +98,10 @@ def test_frames_reach_both_readers():
         ({"variants": {"x": {"crop": "centre"}}}, "unknown crop 'centre'; did you mean 'center'"),
         ({"protocols": {"p": {"crop": "nope"}}}, "protocols.p.crop: unknown crop"),
         ({"run": "a/b"}, "config.run"),
+        ({None: 5}, "expected a name before every ':', found an empty key"),
+        ({"variants": {"x": {"stages": {None: {}, "train": {}}}}}, "found an empty key"),
+        ({"variants": _ENDLESS}, "found one that holds itself"),
+        ({"variants": _MANY}, "refer to one another without end"),
     ],
 )
 def test_typos_end_in_one_line(change, match):

@@ -1,5 +1,7 @@
 """The trainer: it learns, resumes exactly, survives bad steps and stops with one line."""
 
+import errno
+import fcntl
 import json
 import os
 import signal
@@ -252,6 +254,19 @@ def test_state_of_another_experiment_is_moved_aside(tmp_path) -> None:
     other = RunFolder(tmp_path / "s", {"a": 2})
     assert other.load() is None and other.moved_to is not None
     assert (other.moved_to / "state.pt").exists()
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_disk_without_locks_is_no_obstacle(tmp_path, monkeypatch, number) -> None:
+    def flock(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    RunFolder(tmp_path / "s", {"a": 1}).save({"step": 3})
+    assert RunFolder(tmp_path / "s", {"a": 1}).load() == {"step": 3}
+    number = errno.EIO
+    with pytest.raises(OSError, match="Input/output"):
+        RunFolder(tmp_path / "s", {"a": 1})
 
 
 def test_two_trainings_never_share_a_folder(tmp_path) -> None:
