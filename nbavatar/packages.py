@@ -40,6 +40,8 @@ def remedy(module: str) -> str:
     name = module.partition(".")[0]
     if name in _SYSTEM and installed(name):
         return f"on Debian and Ubuntu: apt-get install {_SYSTEM[name]}"
+    if installed(name):  # it is there and does not load: what it was built against is not
+        return f"run: python -m pip install --force-reinstall {distribution_of(name)}"
     return f"run: {install_line(name)}"
 
 

@@ -24,14 +24,15 @@ import torch
 from torch import Tensor
 
 from nbavatar.errors import DependencyError, DeviceError, require
+from nbavatar.packages import install_line
 from nbavatar.raster.projection import Projection
 from nbavatar.raster.reference import BlendSettings
 
 cuda: Any = require("numba.cuda", "numba-cuda", "rendering on a GPU")
 if not cuda.is_available():
     raise DependencyError(
-        "package 'numba-cuda' finds no CUDA driver or toolkit; it is needed for rendering on a GPU; "
-        "install it with: python -m pip install 'numba-cuda[cu12]'"
+        "package 'numba-cuda' finds no CUDA driver, or no compiler for it; it is needed for rendering on a GPU; "
+        f"install NVIDIA's driver for CUDA 13 and run: {install_line('numba-cuda')}"
     )
 
 from nbavatar.raster import cuda_kernels as kernels  # noqa: E402  (needs the package that was just looked for)

@@ -19,19 +19,14 @@ def test_text_says_where_to_get_what_is_not_there(tmp_path, capsys):
 
 
 def test_a_broken_package_is_named_with_the_verbs_that_need_it(tmp_path, capsys, monkeypatch):
-    real = doctor.importlib.import_module
-
-    def broken(name, *more):
-        if name == "cv2":
-            raise ImportError("libGL.so.1: cannot open shared object file")
-        return real(name, *more)
-
-    monkeypatch.setattr(doctor.importlib, "import_module", broken)
-    monkeypatch.setattr(doctor, "examine", doctor.examine)
+    _without(monkeypatch, cv2="libGL.so.1: cannot open shared object file")
     found = doctor.examine(tmp_path)
     assert found["broken"]["cv2"].startswith("libGL.so.1") and "masks" in [v for v, n in found["verbs"].items() if n]
     text = "\n".join(doctor._lines(found))
-    assert "MISSING    opencv-contrib-python-headless: libGL.so.1" in text and "pip install opencv" in text
+    assert (
+        "MISSING    opencv-contrib-python-headless: libGL.so.1" in text
+        and "pip install --force-reinstall opencv" in text
+    )
 
 
 def _without(monkeypatch, **reasons):
@@ -58,7 +53,7 @@ def test_brief_is_one_line_that_names_what_is_missing_and_what_to_do(tmp_path, c
     (line,) = capsys.readouterr().out.splitlines()
     assert line == (
         "doctor: torch cannot be imported: libcudnn.so.9: cannot open shared object file; "
-        "run: python -m pip install torch"
+        "run: python -m pip install --force-reinstall torch"
     )
 
 

@@ -48,7 +48,7 @@ def test_asks_for_the_package_and_for_a_gpu(monkeypatch):
         render_gaussians(*scene, view, K, 40, 30, backend="gsplat")
     monkeypatch.setitem(sys.modules, "gsplat", None)
     settings = SplatSettings(40, 30, 1 / 255, 0.99, 1e-4)
-    with pytest.raises(DependencyError, match="install it with: python -m pip install gsplat"):
+    with pytest.raises(DependencyError, match="run: python -m pip install gsplat"):
         render_gsplat(*scene, view, K, settings, near=0.01, low_pass=0.3, screen_offsets=None)
 
 

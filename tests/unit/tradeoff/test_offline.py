@@ -1,10 +1,13 @@
 """Knobs of the stages before training: errors by independent means, on shapes with known answers."""
 
+import json
+
 import numpy as np
 import pytest
 
 from nbavatar.config.tradeoff import OfflineConfig
 from nbavatar.data.sequences import MeshSequence, Part
+from nbavatar.errors import DependencyError, require
 from nbavatar.tradeoff.offline import decimate, decimation_rows, spectral_rows
 from nbavatar.tradeoff.section import offline_section, tradeoff_section
 
@@ -29,6 +32,15 @@ def sphere(rings: int = 14) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture
+def pymeshlab() -> None:
+    """Skips where the system lacks a library that pymeshlab wants, which no other stage does; CI installs them."""
+    try:
+        require("pymeshlab", "pymeshlab", "these tests")
+    except DependencyError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
 def ball() -> MeshSequence:
     """The sphere, at rest, moved, and stretched."""
     verts, faces = sphere()
@@ -37,7 +49,7 @@ def ball() -> MeshSequence:
 
 
 @pytest.mark.slow  # pymeshlab takes seconds to start
-def test_a_coarser_sphere_is_still_a_sphere_and_rides_along(ball) -> None:
+def test_a_coarser_sphere_is_still_a_sphere_and_rides_along(ball, pymeshlab) -> None:
     coarse = decimate(ball, 0.4)
     part, whole = coarse.parts["head"], ball.parts["head"]
     assert len(part.faces) == pytest.approx(0.4 * len(whole.faces), rel=0.05)
@@ -50,7 +62,7 @@ def test_a_coarser_sphere_is_still_a_sphere_and_rides_along(ball) -> None:
 
 
 @pytest.mark.slow
-def test_coarser_meshes_are_farther_from_the_original(ball) -> None:
+def test_coarser_meshes_are_farther_from_the_original(ball, pymeshlab) -> None:
     rows = list(decimation_rows(ball, OfflineConfig(decimate_shares=[1.0, 0.5, 0.15], decimate_frames=3)))
     assert [row["faces"] for row in rows] == sorted((row["faces"] for row in rows), reverse=True)
     errors = [row["error_mm"] for row in rows]
@@ -78,3 +90,24 @@ def test_a_sweep_says_which_pictures_judge_where_they_are_smaller():
     }
     assert captions["older"] == captions["same"] and "32x32" not in captions["same"]
     assert "32x32 px" in captions["smaller"]
+
+
+def test_without_pymeshlabs_libraries_only_the_coarser_meshes_are_left_out(ball, tmp_path, monkeypatch, capsys):
+    """pymeshlab wants libGL from the system. The other stages are measured, and the sheet says what is lacking."""
+    import sys
+
+    from nbavatar.cli import main
+    from nbavatar.data.sequences import write_sequence
+    from nbavatar.tradeoff import offline
+
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    monkeypatch.setattr(offline, "contact_rows", lambda *_: [])
+    monkeypatch.setattr(offline, "refit_rows", lambda *_: [])
+    write_sequence(tmp_path / "meshes.npz", ball, {})
+    sheet = json.dumps({"offline": {"spectral_modes": [3]}})
+    words = ["--meshes", str(tmp_path / "meshes.npz"), "--sheet", sheet, "--out", str(tmp_path / "out")]
+    assert main(["tradeoff", "--offline", *words]) == 0
+    assert "warning: no coarser meshes are measured: package 'pymeshlab'" in capsys.readouterr().err
+    result = json.loads((tmp_path / "out" / "offline.json").read_text(encoding="utf-8"))
+    assert [row["stage"] for row in result["rows"]] == ["spectral"] and "pymeshlab" in result["lacking"]
+    assert any("Coarser meshes were not measured" in text for text in offline_section(result, "").paragraphs)
