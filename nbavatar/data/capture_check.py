@@ -272,8 +272,8 @@ def _check_poses(root: Path, judge: PoseJudge, report: CaptureReport, found: _Co
     path = root / "cameras.json"
     lines = judge.defects(path)
     report.overlap, report.astray = judge.overlaps(), judge.misfits()
-    for number, line in enumerate(lines):
-        found.note(f"poses {number}", line)
+    for line in lines:
+        found.note("poses", line)
     for name, astray in report.astray.items() if not lines else ():
         if astray > _MUCH_ASTRAY:
             report.notes.append(

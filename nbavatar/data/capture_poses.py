@@ -247,14 +247,21 @@ class PoseJudge:
         K[:2] /= self._step(camera)
         face, _, _ = rasterize_mesh(points, faces, K, width, height)
         drawn = face >= 0
-        if not drawn.any():
-            return _Fit(1.0, 0.0, 0.0)
-        agree = (view.mask == part[face]) if view.labelled else (view.mask > 0)
         there = view.mask > 0
         both = float((drawn & there).sum())
-        covered = both / there.sum()
-        met = (agree & drawn).sum() / drawn.sum() * min(1.0, covered / _LEAST_COVERED)
-        return _Fit(float(1.0 - met), float(covered), float(both / (drawn | there).sum()))
+        if view.labelled:
+            # A part that is in the mask has to be drawn as well: it may lie outside the image.
+            shown = np.where(drawn, part[face], 0)
+            pairs = [(shown == PARTS.index(name) + 1, view.mask == PARTS.index(name) + 1) for name in names]
+        else:
+            pairs = [(drawn, there)]
+        met, weight = 0.0, 0.0
+        for mesh_pixels, mask_pixels in pairs:
+            agree, size, wanted = (x.sum() for x in (mesh_pixels & mask_pixels, mesh_pixels, mask_pixels))
+            met += agree * min(1.0, agree / max(_LEAST_COVERED * wanted, 1.0))
+            weight += size if size else wanted
+        misfit = 1.0 - met / weight if weight else 1.0
+        return _Fit(float(misfit), both / float(there.sum()), both / float(max((drawn | there).sum(), 1)))
 
     @staticmethod
     def _step(camera: Camera) -> int:
