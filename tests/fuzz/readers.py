@@ -172,7 +172,7 @@ def _capture(path: Path) -> None:
     plan = plan_capture(capture, start=0, every=1, max_frames=0, test_fraction=0.2, test_blocks=1)
     topology = read_topology(root)
     for frame in plan.frames[:1]:
-        read_mesh(root, frame, topology)
+        read_mesh(capture, frame, topology)
     for camera in capture.cameras.values():
         np.linalg.inv(camera.cam_from_world)
 
