@@ -111,7 +111,7 @@ def _capture_masks(
         raise DataError.of(where, expected="a mask (or an alpha image) for each frame", found="none", fix=fix)
     read = ((frame, frame_masks(masks, frame)) for frame in frames)
     if "person" in layers:
-        return ((frame, images["person"], None) for frame, images in read), True
+        return ((frame, images["person"], images.get("alpha")) for frame, images in read), True
     return ((frame, images["label"], images["alpha"]) for frame, images in read), False
 
 
@@ -122,10 +122,10 @@ def _masks(
     if supplied:
         own, meaning = supplied_masks(supplied, subject, camera, pack.frames, parts)
         return ((frame, mask, None) for frame, mask in zip(pack.frames, own)), meaning.kind == "person"
-    if "label" in pack.layers:
-        alpha = "alpha" in pack.layers
-        return ((f, pack.read("label", f), pack.read("alpha", f) if alpha else None) for f in pack.frames), False
-    if "person" in pack.layers:
-        return ((frame, pack.read("person", frame), None) for frame in pack.frames), True
+    alpha = "alpha" in pack.layers
+    for layer in ("label", "person"):
+        if layer in pack.layers:
+            read = ((f, pack.read(layer, f), pack.read("alpha", f) if alpha else None) for f in pack.frames)
+            return read, layer == "person"
     fix = "supply masks of your own with --supplied"
     raise DataError.of(pack.path, "layers", expected="person or label", found=", ".join(pack.layers), fix=fix)

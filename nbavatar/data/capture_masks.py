@@ -17,7 +17,7 @@ from nbavatar.io.pictures import read_plane
 
 __all__ = ["CameraMasks", "open_masks"]
 
-_COMPARED = 16  # frames in which labels and coverage are compared
+_COMPARED = 16  # frames in which masks and coverage are compared
 _LEAST_COVERED = 0.5
 
 
@@ -73,25 +73,26 @@ def open_masks(capture: Capture, camera: Camera, frames: Sequence[str]) -> Camer
         meaning = masks.masks(capture.root / "masks" / camera.name, parts)
     coverage = None if alpha is None else alpha.coverage(capture.root / "alpha" / camera.name)
     opened = CameraMasks(capture.root, camera, meaning, coverage)
-    if meaning is not None and meaning.kind == "label" and coverage is not None:
+    if meaning is not None and coverage is not None:
         _compare(opened, spread(frames, _COMPARED))
     return opened
 
 
 def _compare(masks: CameraMasks, frames: Sequence[str]) -> None:
-    """Refuses alpha images that are another picture than the labels: inverted, of other frames, of another camera."""
-    labelled, covered, elsewhere = 0, 0, 0
+    """Refuses alpha images that are another picture than the masks: inverted, of other frames, of another camera."""
+    least = 0 if masks.mask is not None and masks.mask.kind == "label" else MATTE_THRESHOLD
+    masked, covered, elsewhere = 0, 0, 0
     for frame in frames:
-        label, alpha = masks.read_mask(frame), masks.read_coverage(frame)
-        if label is not None and alpha is not None:
-            labelled += int((label > 0).sum())
-            covered += int(((label > 0) & (alpha > MATTE_THRESHOLD)).sum())
-            elsewhere += int(((label == 0) & (alpha > MATTE_THRESHOLD)).sum())
-    if labelled and covered < _LEAST_COVERED * labelled:
+        mask, alpha = masks.read_mask(frame), masks.read_coverage(frame)
+        if mask is not None and alpha is not None:
+            masked += int((mask > least).sum())
+            covered += int(((mask > least) & (alpha > MATTE_THRESHOLD)).sum())
+            elsewhere += int(((mask <= least) & (alpha > MATTE_THRESHOLD)).sum())
+    if masked and covered < _LEAST_COVERED * masked:
         where = masks.root / "alpha" / masks.camera.name
-        found = f"{covered / labelled:.0%} of the labelled pixels covered, and {elsewhere} pixels elsewhere"
-        fix = "are they inverted?" if elsewhere > labelled else "do they belong to these frames?"
-        raise DataError.of(where, expected="coverage where the masks have labels", found=found, fix=fix)
+        found = f"{covered / masked:.0%} of the masks' pixels covered, and {elsewhere} pixels elsewhere"
+        fix = "are they inverted?" if elsewhere > masked else "do they belong to these frames?"
+        raise DataError.of(where, expected="coverage where the masks are", found=found, fix=fix)
 
 
 def _survey(capture: Capture, camera: Camera, kind: str, frames: Sequence[str]) -> ValueSurvey | None:

@@ -56,12 +56,14 @@ def _in_step(colour: Path, matte: Path, plan: FramePlan) -> Iterator[tuple[str, 
 def capture_layers(masks: CameraMasks) -> tuple[str, ...]:
     """Layers that `capture_images` will yield, from the kinds of masks that the capture holds.
 
-    Label masks give rgb, label, alpha; mattes, or alpha alone, give rgb and person (to be cut by the meshes); a capture
-    with neither gives rgb only, which is enough where masks are supplied separately.
+    Label masks give rgb, label, alpha; mattes, or alpha alone, give rgb and person (to be cut by the meshes), and alpha
+    where there is any; a capture with neither gives rgb only, which is enough where masks are supplied separately.
     """
-    if masks.mask is None:
-        return ("rgb",) if masks.coverage is None else ("rgb", "person")
-    return ("rgb", "person") if masks.mask.kind == "person" else ("rgb", "label", "alpha")
+    if masks.mask is not None and masks.mask.kind == "label":
+        return ("rgb", "label", "alpha")
+    if masks.coverage is not None:
+        return ("rgb", "person", "alpha")
+    return ("rgb",) if masks.mask is None else ("rgb", "person")
 
 
 def capture_images(
@@ -69,7 +71,7 @@ def capture_images(
 ) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     """Yields (frame id, images of `capture_layers`) of the masks' camera.
 
-    Coverage is the capture's alpha within its labels' reach, or 255 wherever a label is. Where alpha is above zero
+    Coverage of labels is the capture's alpha within their reach, or 255 wherever a label is. Where alpha is above zero
     and the label is 0 (hair, soft edges) the label is taken from the nearest labelled pixel, so that every covered
     pixel belongs to a part.
     """
@@ -79,17 +81,19 @@ def capture_images(
 
 def frame_masks(masks: CameraMasks, frame: str) -> dict[str, np.ndarray]:
     """The layers of `capture_layers` but rgb, of one frame."""
-    layers, images = capture_layers(masks), {}
-    if "person" in layers:
-        person = masks.read_coverage(frame) if masks.mask is None else masks.read_mask(frame)
+    layers, mask, alpha = capture_layers(masks), masks.read_mask(frame), masks.read_coverage(frame)
+    images: dict[str, np.ndarray] = {}
+    if "label" in layers:
+        assert mask is not None
+        if alpha is None:
+            alpha = np.where(mask > 0, np.uint8(255), np.uint8(0))
+        images["label"], images["alpha"] = _agree(mask, alpha)
+    elif "person" in layers:
+        person = mask if mask is not None else alpha
         assert person is not None
         images["person"] = person
-    if "label" in layers:
-        label, alpha = masks.read_mask(frame), masks.read_coverage(frame)
-        assert label is not None
-        if alpha is None:
-            alpha = np.where(label > 0, np.uint8(255), np.uint8(0))
-        images["label"], images["alpha"] = _agree(label, alpha)
+        if alpha is not None:
+            images["alpha"] = alpha
     return images
 
 

@@ -177,7 +177,7 @@ LOUD = {
     "coloured labels": (pictures("masks", lambda v: np.eye(4, 3, -1, np.uint8)[v] * 255), "ingest", "found colours: ("),
     "alpha inverted": (
         after(also_alpha, pictures("alpha", lambda v: 255 - v)),
-        "ingest", "alpha/left: expected coverage where the masks have labels, found 0%",
+        "ingest", "alpha/left: expected coverage where the masks are, found 0%",
     ),
     "labels stretched in alpha": (
         lambda c: shutil.copytree(c / "masks", c / "alpha"), "ingest", "alpha/left: values: expected coverage",

@@ -114,6 +114,27 @@ def test_a_person_of_0_and_1_is_cut_by_the_meshes_as_one_of_0_and_255_is(prepare
         assert set(np.unique(pack.read("label", "t3"))) == {0, 1}
 
 
+def test_alpha_beside_a_matte_is_its_coverage(capture, tmp_path):
+    rng = np.random.default_rng(0)
+    for path in capture.glob("masks/*/*.png"):
+        matte = np.where(np.array(Image.open(path)) > 0, 255, 0).astype(np.uint8)
+        Image.fromarray(matte).save(path)
+        target = capture / "alpha" / path.parent.name / path.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.where(matte > 0, rng.integers(200, 256, matte.shape), 0).astype(np.uint8)).save(target)
+    common = ["--layout", "capture", "--root", str(capture), "--subject", "me"]
+    assert main(["tracks", *common, "--out", str(tmp_path / "t.npz")]) == 0
+    for more in ([], ["--images-only"]):
+        assert main(["ingest", *common, "--camera", "left", "--out", str(tmp_path / "left.zip"), *more]) == 0
+        assert masks(tmp_path, *(["--capture", str(capture)] if more else []), temporal=False) == 0
+        with FramePack(tmp_path / "m.zip") as pack:
+            for frame in pack.frames:
+                given = np.array(Image.open(capture / f"alpha/left/{frame}.png"))
+                label, alpha = pack.read("label", frame), pack.read("alpha", frame)
+                assert (label > 0).sum() > 500 and (label[given == 0] == 0).all()
+                np.testing.assert_array_equal(alpha, np.where(label > 0, given, 0))
+
+
 def test_bad_masks_of_one_s_own(prepared, capfd):
     own = prepared / "own" / "left"
     own.mkdir(parents=True)

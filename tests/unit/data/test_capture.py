@@ -148,7 +148,7 @@ def test_person_masks_and_alpha_alone_are_left_for_the_meshes_to_cut(capture):
     (capture / "masks" / "left").rename(capture / "alpha" / "left")
     Image.fromarray(np.zeros((80, 96), np.uint8)).save(capture / "alpha/left/t2.png")
     masks = open_masks(opened, camera, frames)
-    assert capture_layers(masks) == ("rgb", "person")
+    assert capture_layers(masks) == ("rgb", "person", "alpha")
     pictures = dict(capture_images(opened, masks, frames))
     np.testing.assert_array_equal(pictures["t0"]["person"], masks.read_coverage("t0"))
 
