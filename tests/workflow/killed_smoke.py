@@ -7,13 +7,15 @@ are there: `nbavatar run`, its guard, `nbavatar warm`, Snakemake, a shell, a job
 the seed and printed; the moments of the machine are not, so that no two calls are alike in all. After each kill it is
 checked that no process of the run goes on for longer than the time in which it is allowed to save its state.
 
-Compared byte by byte: all tables in all formats but for measured times, and every evaluated figure. Exit code 0 if all
+Compared to the last digit: all tables in all formats but for measured times and digests of files that hold such, and
+every evaluated figure. Exit code 0 if all
 are the same, no temporary file is left, and no process outlived its run; 1 otherwise.
 """
 
 import argparse
 import json
 import random
+import re
 import subprocess
 import sys
 import time
@@ -68,7 +70,7 @@ def main() -> int:
             try:
                 process.wait(PATIENCE_S)
             except subprocess.TimeoutExpired:
-                process.kill()
+                process.terminate()  # not killed: without its guard only the next run would end what is left
         process.wait(10 * PATIENCE_S)
         _, left = psutil.wait_procs(family, timeout=PATIENCE_S)
         if left:
@@ -108,7 +110,7 @@ def differences(one: Path, other: Path) -> list[str]:
     if not files:
         found.append(f"no tables in {one}")
     for file in files:
-        if not (other / file).is_file() or (one / file).read_bytes() != (other / file).read_bytes():
+        if not (other / file).is_file() or text(one / file) != text(other / file):
             found.append(f"differs: {file}")
     for path in sorted(one.glob("eval/**/*.json")):
         twin = other / path.relative_to(one)
@@ -117,10 +119,15 @@ def differences(one: Path, other: Path) -> list[str]:
     return found
 
 
+def text(path: Path) -> str:
+    """A table but for digests: what they are of tells how long a training took."""
+    return re.sub(r"sha256:[0-9a-f]{64}", "sha256", path.read_text(encoding="utf-8"))
+
+
 def figures(path: Path) -> object:
-    """What a record says but for where and when it was made."""
+    """What a record says but for where, when and how fast it was made."""
     content = json.loads(path.read_text())
-    return {key: value for key, value in content.items() if key != "record"}
+    return {key: value for key, value in content.items() if key not in ("record", "training")}
 
 
 if __name__ == "__main__":
