@@ -211,13 +211,13 @@ def test_verb_refuses_a_camera_that_the_meshes_do_not_know(scene: Scene, tmp_pat
     assert not (tmp_path / "out.npz").exists()
 
 
-def test_verb_stops_where_no_camera_sees_a_part(scene: Scene, tmp_path) -> None:
+def test_verb_stops_where_no_part_is_in_any_image(scene: Scene, tmp_path) -> None:
     packs = _write(scene, tmp_path, split=["train"] * FRAMES)
     sequence, record = read_sequence(tmp_path / "meshes.npz")
     far = {
         name: dataclasses.replace(part, verts=part.verts + np.float32(50.0)) for name, part in sequence.parts.items()
     }
     write_sequence(tmp_path / "meshes.npz", dataclasses.replace(sequence, parts=far), record)
-    with pytest.raises(DataError, match="expected parts that cameras a, b, c see in two frames or more, found none"):
+    with pytest.raises(DataError, match="expected vertices that project into the images of a, b, c, found none"):
         _run(tmp_path, packs, {"iterations": 2})
     assert not (tmp_path / "out.npz").exists()
