@@ -38,24 +38,22 @@ def test_imported_captures_train_and_are_judged(tmp_path: Path) -> None:
     for name in ("Snakefile", "workflow", "config", "nbavatar"):
         (project / name).symlink_to(ROOT / name)
     masks = {"masks": {"keep": "person"}}
-    options = {**TINY, "stages": {**TINY["stages"], **masks, "align": {"iterations": 1}}}
+    options = {**TINY, "stages": {**TINY["stages"], **masks, "align": {"iterations": 0}}}
     (tmp_path / "tiny.json").write_text(json.dumps(options))
     environment = {**os.environ, "PYTHONPATH": str(project), "OMP_NUM_THREADS": "1"}
     environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
-    scores = [
-        f"results/capture/eval/{path.name}/full/{name}.json" for path in captures.iterdir() for name in ("nv", "sr")
-    ]
+    judged = {"vhap": ("nv", "sr"), "nerfstudio": ("nv",), "colmap": ("nv",)}
+    scores = [f"results/capture/eval/{name}/full/{kind}.json" for name, kinds in judged.items() for kind in kinds]
     command = [
         sys.executable, "-m", "nbavatar", "warm", "--", "snakemake", "--cores", "2", *scores,
         "--configfile", "config/capture.yaml", str(tmp_path / "tiny.json"), "--config", f"data_root={captures}",
     ]  # fmt: skip
-    done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, timeout=500)
+    done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
-    assert len(scores) == 6
     for score in scores:
         metrics = json.loads((project / score).read_text())["metrics"]
         assert np.isfinite(list(metrics.values())).all()
     # VHAP's own split is judged: its held-out camera in the training moments, its held-out moment in the others.
-    judged = {name: FramePack(project / f"results/capture/render/vhap/full/{name}.zip").frames for name in ("nv", "sr")}
-    assert judged["nv"] == [f"222200037/0000{time}" for time in range(4)]
-    assert judged["sr"] == ["222200036/00004", "222200038/00004"]
+    shown = {name: FramePack(project / f"results/capture/render/vhap/full/{name}.zip").frames for name in ("nv", "sr")}
+    assert shown["nv"] == [f"222200037/0000{time}" for time in range(4)]
+    assert shown["sr"] == ["222200036/00004", "222200038/00004"]
