@@ -398,5 +398,7 @@ READERS = {
     "VHAP flame_param": Reader(lambda d: seeds.foreign(d, "vhap", "flame_param/*.npz"), _imported, "zip"),
     "COLMAP cameras.bin": Reader(lambda d: seeds.foreign(d, "colmap", "cameras.bin"), _imported, "bytes"),
     "COLMAP images.bin": Reader(lambda d: seeds.foreign(d, "colmap", "images.bin"), _imported, "bytes"),
+    "COLMAP cameras.txt": Reader(lambda d: seeds.foreign(d, "colmap text", "cameras.txt"), _imported, "text"),
+    "COLMAP images.txt": Reader(lambda d: seeds.foreign(d, "colmap text", "images.txt"), _imported, "text"),
     "wheel of the detector": Reader(seeds.wheel, _wheel, "zip"),
 }

@@ -332,7 +332,7 @@ def _write_foreign(root: Path, what: str) -> None:
     elif what == "nerfstudio":
         written.write_nerfstudio(root, lens=written.LENS)
     else:
-        written.write_colmap(root, binary=True)
+        written.write_colmap(root, binary="text" not in what)
     (root / "IS").write_text(what)
 
 
