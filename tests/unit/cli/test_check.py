@@ -164,3 +164,27 @@ def test_a_complete_decaf_is_read_and_its_conventions_are_measured(decaf, tmp_pa
     np.save(decaf / "train/head_keys/S2/084.npy", np.zeros((11, 68, 3)))
     assert main(["check", "--layout", "decaf", str(decaf), *here[:5]]) == 2
     assert "head_keys/S2/084.npy: frames: expected 12" in errors(capfd)[0]
+
+
+def test_masks_supplied_elsewhere_are_checked_in_place_of_the_capture_s(capture, tmp_path, capfd):
+    shutil.move(capture / "masks", tmp_path / "own")
+    assert main(["check", str(capture)]) == 2
+    assert "expected a mask (or an alpha image) for each frame" in errors(capfd)[0]
+    words = ["check", str(capture), "--supplied", str(tmp_path / "own"), "--subject", "me"]
+    assert main([*words, "--overview", str(tmp_path / "o.png"), "--record", str(tmp_path / "r.json")]) == 0
+    yellow = (decode_image(tmp_path / "o.png") == [255, 255, 0]).all(-1).sum()
+    assert yellow > 50, "outlines of the supplied masks are drawn"
+    record = json.loads((tmp_path / "r.json").read_text())
+    assert record["defects"] == [] and set(record["overlap"]) == {"left", "right"} and record["frames"] == 5
+    (tmp_path / "own/right/t3.png").unlink()
+    assert main(words) == 2
+    assert "right: frame t3: expected a mask" in errors(capfd)[0]
+
+
+def test_defects_may_be_said_only(capture, tmp_path, capfd):
+    (capture / "images/left/t1.png").unlink()
+    record = tmp_path / "r.json"
+    assert main(["check", str(capture), "--record", str(record)]) == 2 and not record.exists()
+    assert main(["check", str(capture), "--record", str(record), "--cfg", '{"stop": false}']) == 0
+    assert "t1.jpg: expected an image" in json.loads(record.read_text())["defects"][0]
+    assert len(errors(capfd)) == 2
