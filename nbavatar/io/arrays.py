@@ -97,7 +97,9 @@ def read_plain_array(stream: IO[bytes], size: int) -> np.ndarray:
     if dtype.names is not None:
         raise ValueError("an array of records")
     stream.seek(0)
-    return check_text(np.lib.format.read_array(stream, allow_pickle=False))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it parses the header once more
+        return check_text(np.lib.format.read_array(stream, allow_pickle=False))
 
 
 def check_text(array: np.ndarray) -> np.ndarray:
