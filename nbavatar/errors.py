@@ -35,13 +35,14 @@ _LONGEST = 1000  # characters of a line
 class NBAvatarError(Exception):
     """Base of all errors whose cause lies outside the program.
 
-    Names and values in the text come from files: what a terminal would obey instead of showing is written out, and
-    lines beyond all measure are cut in the middle.
+    Names and values in the text come from files: what a terminal would obey instead of showing is written out, and all
+    is one line, cut in the middle where it is long beyond all measure.
     """
 
     def __init__(self, text: str = "") -> None:
-        lines = (line if len(line) <= _LONGEST else f"{line[:600]} ... {line[-300:]}" for line in text.split("\n"))
-        super().__init__("\n".join("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line) for line in lines))
+        line = " ".join(text.splitlines())
+        line = line if len(line) <= _LONGEST else f"{line[:600]} ... {line[-300:]}"
+        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line))
 
     @classmethod
     def of(cls, where: object, field: str = "", *, expected: object, found: object, fix: str = "") -> Self:

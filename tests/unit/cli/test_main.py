@@ -56,6 +56,7 @@ def test_version():
         (OSError(5, "Input/output error"), "nbavatar doctor: error: file system: Input/output error"),
         (IsADirectoryError(21, "Is a directory", b"a\xff\x1b"), "nbavatar doctor: error: 'a"),
         (MemoryError("Unable to allocate 9 GiB"), "nbavatar doctor: error: out of memory: Unable to allocate 9 GiB"),
+        (DataError("no camera 'a\nb'"), "nbavatar doctor: error: no camera 'a b'"),
         (DataError("a\x1b]0;b\x07 " + "c" * 5000), "nbavatar doctor: error: a\\x1b]0;b\\x07 ccc"),
         (
             ModuleNotFoundError("No module named 'igl'", name="igl"),
