@@ -14,7 +14,7 @@ from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, Spect
 from nbavatar.config.preprocess import CheckConfig, CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
 from nbavatar.config.yamlfiles import check_tree
-from nbavatar.errors import ConfigError, did_you_mean
+from nbavatar.errors import ConfigError, describe, did_you_mean
 from nbavatar.names import check_name, check_place
 
 __all__ = ["RunConfig", "Stages", "TradeoffRun", "Variant", "load_run", "stage_options"]
@@ -138,6 +138,9 @@ def load_run(mapping: Mapping[str, Any], where: str = "config") -> RunConfig:
         for stage in variant.stages:
             if stage not in stages:
                 raise ConfigError(f"{where}.variants.{name}: unknown stage '{stage}'; {did_you_mean(stage, stages)}")
+            if not isinstance(variant.stages[stage], Mapping):
+                place, found = f"{where}.variants.{name}.stages.{stage}", describe(variant.stages[stage])
+                raise ConfigError.of(place, expected="a mapping of options", found=found)
             _resolved(run, stage, name)
     for name in (*run.videos, *run.tradeoff.variants):
         if name not in run.variants:

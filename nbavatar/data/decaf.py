@@ -174,8 +174,9 @@ def read_camera(subject: DecafSubject, camera: str, *, pixel_center: float = 0.5
         raise DataError.of(where, "intrinsic", expected="no skew", found=f"a skew of {K[0, 1]}")
     pose = _matrix(entry, "extrinsic", ((4, 4), (3, 4)), where)
     pose = np.vstack([pose[:3], [0.0, 0.0, 0.0, 1.0]])
-    off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
-    if off > 1e-3 or np.linalg.det(pose[:3, :3]) < 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
+    if not off <= 1e-3 or np.linalg.det(pose[:3, :3]) < 0:
         found = f"one that is off by {off:.2g}, determinant {np.linalg.det(pose[:3, :3]):.3g}"
         raise DataError.of(where, "extrinsic", expected="a rotation", found=found)
     with parsing(where, "distortion coefficients", damaged="something else"):

@@ -98,6 +98,7 @@ for _ in range(40):
         ({"variants": {"x": {"crop": "centre"}}}, "unknown crop 'centre'; did you mean 'center'"),
         ({"protocols": {"p": {"crop": "nope"}}}, "protocols.p.crop: unknown crop"),
         ({"run": "a/b"}, "config.run"),
+        ({"variants": {"x": {"stages": {"train": None}}}}, "x.stages.train: expected a mapping of options, found None"),
         ({None: 5}, "expected a name before every ':', found an empty key"),
         ({"variants": {"x": {"stages": {None: {}, "train": {}}}}}, "found an empty key"),
         ({"variants": _ENDLESS}, "found one that holds itself"),
