@@ -12,6 +12,7 @@ import argparse
 import contextlib
 import os
 import shutil
+import signal
 import socket
 import stat
 import subprocess
@@ -152,6 +153,7 @@ def main() -> int:
     if not available():
         print(f"loopback: root, {', '.join(PROGRAMS)}, and no {CONFIGURATION} of another are needed", file=sys.stderr)
         return 2
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that all of it ends then, too
     with slurm() as environment:
         return subprocess.run(command, env=environment).returncode
 
