@@ -170,7 +170,11 @@ def _drawable(points: Sequence[tuple[float, float]], log_y: bool) -> list[tuple[
 
 def widened(low: float, high: float) -> tuple[float, float]:
     """The range itself, or one around it if it has no extent."""
-    return (low, high) if high > low else (low - 0.5, high + 0.5)
+    largest = max(abs(low), abs(high))
+    if high - low > 1e-12 * largest and high - low > 1e-30:
+        return low, high
+    margin = max(0.5, 1e-6 * largest)  # half a unit is nothing beside large numbers
+    return low - margin, high + margin
 
 
 def ticks(low: float, high: float, log: bool) -> list[tuple[float, str]]:
@@ -195,6 +199,8 @@ def _log_ticks(low: float, high: float) -> list[tuple[float, str]]:
 
 def _round_values(low: float, high: float) -> list[float]:
     raw = (high - low) / 4
+    if not 0 < raw < 1e300:  # no damaged record has an axis worth drawing
+        return []
     unit = 10 ** math.floor(math.log10(raw))
     step = next(unit * m for m in (1, 2, 5, 10) if unit * m >= raw * 0.999)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
