@@ -68,6 +68,8 @@ def read_vhap(
             _note_model(models, frame, moment, root, allowed, where)
             if isinstance(frame.get("timestep_index_original"), int):
                 original[moment] = frame["timestep_index_original"]
+    if not shots:
+        raise DataError.of(lists[0][0], "frames", expected="pictures with calibrations", found="none")
     source = Source(whole if whole.is_file() else root, list(shots.values()), inputs=inputs)
     source.meshes = _meshes(root, models, {moment for _, moment in shots}, flame, source)
     _split(source, {name: _identities(files[name], frames) for name, (_, frames) in read.items()})

@@ -183,6 +183,9 @@ def test_vhap_without_a_model_or_with_other_meshes_is_refused(tmp_path, capfd):
     source = foreign.write_vhap(tmp_path / "vhap")
     assert run("vhap", source, tmp_path / "me") == 2
     assert "name it with --flame" in errors(capfd)[0]
+    foreign.edit(source / "transforms.json", lambda top: top.update(frames=[]))
+    assert run("vhap", source, tmp_path / "me") == 2
+    assert "frames: expected pictures with calibrations, found none" in errors(capfd)[0]
     meshes = foreign.write_vhap(tmp_path / "meshes", mode="mesh")
     verts, faces = read_mesh_file(meshes / "meshes/00003.obj")
     foreign.write_obj(meshes / "meshes/00003.obj", verts, faces[::-1])
