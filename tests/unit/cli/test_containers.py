@@ -115,7 +115,7 @@ def test_as_a_user_without_account_and_home(ordinary, public_folder):
     if subprocess.run(["setpriv", f"--reuid={OTHER}", sys.executable, "-c", ""], capture_output=True).returncode != 0:
         pytest.skip("this Python is readable for root only")
     prefix = ["setpriv", f"--reuid={OTHER}", f"--regid={OTHER}", "--clear-groups"]
-    weights, _ = works(scene, out, prefix, HOME=None, XDG_CACHE_HOME=None)
+    weights, _ = works(scene, out, prefix, HOME=None, XDG_CACHE_HOME=None, TMPDIR=public_folder)
     same(weights, ordinary)
     assert not (ROOT / "~").exists() and not Path("/~").exists()
 
@@ -138,7 +138,7 @@ def test_where_another_user_owns_the_folder(public_folder):
     """As a root-squashed disk does: everything can be read, nothing written."""
     scene = write_scene(public_folder)
     prefix = ["setpriv", f"--reuid={OTHER}", f"--regid={OTHER}", "--clear-groups"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "HOME": "/nonexistent"}
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "HOME": "/nonexistent", "TMPDIR": str(public_folder)}
     locked = public_folder / "locked"
     locked.mkdir(mode=0o755)
     for command in commands(scene, locked):
