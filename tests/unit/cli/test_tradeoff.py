@@ -121,7 +121,12 @@ def test_training_takes_order_and_window_from_a_preset(tmp_path) -> None:
     from nbavatar.cli.common import training_preset
 
     setting = {"order": "center", "roi": False, "precision": "bf16", "texels": 2}
-    entry = {"device": "x", "size": [1, 1], "presets": {"fast": {"setting": setting, "label": "", "why": ""}}}
+    entry = {
+        "device": "x",
+        "size": [1, 1],
+        "presets": {"fast": {"setting": setting, "label": "", "why": ""}},
+        "points": [],
+    }
     content = {"kind": "nbavatar presets", "format": 1, "model": "m", "measured": [entry | {"importance": None}]}
     (tmp_path / "presets.json").write_text(json.dumps(content))
     config = training_preset("fast", str(tmp_path / "presets.json"), TrainConfig(texels=8))

@@ -62,7 +62,7 @@ def test_judges(outcome, limits, verdict, text):
     [
         (Refusal("no point"), "refuses"),
         (DataError("depth: expected a number, found NaN"), "refuses"),
-        (DataError("two\nlines"), "defect"),
+        (Refusal("two\nlines"), "defect"),
         (ValueError(""), "defect"),
         (KeyError("x"), "defect"),  # an accident, even where a refusal is right
     ],
