@@ -20,6 +20,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from nbavatar.cli.supervision import run_workflow, wait
 from nbavatar.errors import DataError, DependencyError
@@ -37,13 +38,24 @@ _OURSELVES = (sys.executable, "-m", "nbavatar")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
-    what = parser.add_subparsers(dest="what", required=True, metavar="smoke|capture|paper")
+    what = parser.add_subparsers(dest="what", required=True, metavar="smoke|capture|paper", parser_class=_Parser)
     for name, text in _WHAT.items():
-        own = what.add_parser(name, help=text, description=text)
+        own = what.add_parser(name, help=text, description=text, epilog="What follows `--` goes to snakemake.")
         if name == "capture":
             own.add_argument("folder", metavar="FOLDER", help="the capture")
         own.add_argument("--cores", type=int, metavar="N", help="processors to use (default: all)")
-        own.add_argument("snakemake", nargs="*", metavar="-- WORDS", help="further words for snakemake")
+
+
+class _Parser(argparse.ArgumentParser):
+    """Takes the words after `--` as they are; as positional arguments they could not stand behind an option."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As ever, with the words after `--` in `snakemake`."""
+        words: list[str] = list(args or ())
+        end = words.index("--") if "--" in words else len(words)
+        parsed, unknown = super().parse_known_args(words[:end], namespace)
+        parsed.snakemake = words[end + 1 :]
+        return parsed, unknown
 
 
 def main(args: argparse.Namespace) -> int:

@@ -65,6 +65,28 @@ def test_a_capture_is_handed_over_as_text_whatever_its_name(calls, tmp_path, mon
         assert key == "data_root" and yaml.safe_load(value) == name
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["capture", "data", "--cores", "1", "--", "stage_masks", "-n"],
+        ["capture", "--cores", "1", "data", "--", "stage_masks", "-n"],
+        ["capture", "--cores=1", "data", "--", "stage_masks", "-n"],
+    ],
+)
+def test_words_for_snakemake_follow_options_in_any_order(calls, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    Path("data").mkdir()
+    assert main(["run", *words]) == 0
+    head = calls[-1]
+    assert head[head.index("--cores") + 1] == "1" and head[head.index("stage_masks") + 1] == "-n"
+
+
+def test_unknown_options_are_refused(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["run", "smoke", "--core", "2", "--cord", "3"])
+    assert stop.value.code == 2 and "--cord" in capsys.readouterr().err
+
+
 def test_own_configuration_replaces_ours(calls, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("data").mkdir()
