@@ -43,8 +43,9 @@ def _without(monkeypatch, **reasons):
 
 def test_brief_is_one_line_that_all_is_well(tmp_path, capsys):
     assert main(["doctor", "--brief", "--root", str(tmp_path)]) == 0
-    (line,) = capsys.readouterr().out.splitlines()
+    line, *limits = capsys.readouterr().out.splitlines()
     assert line.startswith("doctor: ") and "a kernel compiles" in line
+    assert all("tradeoff --offline" in limit for limit in limits), "more only where the system lacks libGL"
 
 
 def test_brief_is_one_line_that_names_what_is_missing_and_what_to_do(tmp_path, capsys, monkeypatch):
