@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from nbavatar.baselines.gaussian_avatars import BoundAnchor, GaussianAvatars
-from nbavatar.baselines.losses import dssim
 from nbavatar.baselines.training import GaussianTraining, camera_extent
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.sequences import MeshSequence
@@ -80,7 +79,7 @@ class GaussianAvatarsTraining(GaussianTraining):
         pair, seen, posed = self.picture(sample, anchor, self.background(options.background, random))
         visible = seen.radii > 0
         rows = visible.nonzero().squeeze(1) if posed.rows is None else posed.rows[visible]
-        terms = {"mse": pair.mse().detach(), "l1": pair.l1(), "dssim": dssim(pair)}
+        terms = {"mse": pair.mse().detach(), "l1": pair.l1(), "dssim": pair.dssim()}
         total = (1.0 - options.weight_ssim) * terms["l1"] + options.weight_ssim * terms["dssim"]
         if len(rows) > 0:
             away = self.avatar.offset[rows].norm(dim=1) - options.threshold_position

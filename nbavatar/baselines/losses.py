@@ -4,19 +4,16 @@ Outside a box around render and truth both are plain background: L1 and squared 
 sum over the box, divided by the pixels of the picture, is the mean over the picture.
 """
 
-import functools
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
+from nbavatar.avatar.losses import loss_dssim, loss_l1, loss_mse
 from nbavatar.data.views import Sample
+from nbavatar.metrics.ssim import WINDOW
 
-__all__ = ["Pair", "compare", "dssim"]
-
-_WINDOW, _SIGMA = 11, 1.5
-_C1, _C2 = 0.01**2, 0.03**2
+__all__ = ["Pair", "compare"]
 
 
 class Pair(NamedTuple):
@@ -35,11 +32,15 @@ class Pair(NamedTuple):
 
     def l1(self) -> Tensor:
         """Mean absolute difference over the whole picture."""
-        return (self.image - self.truth).abs().sum() / (3 * self.pixels)
+        return loss_l1(self.image, self.truth, pixels=self.pixels)
 
     def mse(self) -> Tensor:
         """Mean squared difference over the whole picture."""
-        return (self.image - self.truth).square().sum() / (3 * self.pixels)
+        return loss_mse(self.image, self.truth, pixels=self.pixels)
+
+    def dssim(self) -> Tensor:
+        """1 - SSIM over the whole picture (`loss_dssim`)."""
+        return loss_dssim(self.image, self.truth, pixels=self.pixels)
 
 
 def compare(colour: Tensor, alpha: Tensor, sample: Sample, background: Tensor) -> Pair:
@@ -55,28 +56,12 @@ def compare(colour: Tensor, alpha: Tensor, sample: Sample, background: Tensor) -
     h, w = sample.pixels.shape[-2:]
     planes[:, sample.y0 : sample.y0 + h, sample.x0 : sample.x0 + w] = sample.pixels.to(alpha.device)
     # Two windows of SSIM reach this far from a pixel that differs.
-    rows, columns = _box((alpha.detach() > 0) | (planes[3] > 0) | (planes[4] > 0), _WINDOW - 1)
+    rows, columns = _box((alpha.detach() > 0) | (planes[3] > 0) | (planes[4] > 0), WINDOW - 1)
     planes, colour, alpha = planes[:, rows, columns], colour[:, rows, columns], alpha[rows, columns]
     behind = background[:, None, None]
     truth = planes[:3] + (1.0 - planes[3]) * behind
     image = torch.lerp(colour + (1.0 - alpha) * behind, truth, planes[4])
     return Pair(image, truth, planes[3], height * width)
-
-
-def dssim(pair: Pair) -> Tensor:
-    """1 - SSIM over the whole picture, as the Gaussian splatting codes compute it.
-
-    Wang et al. 2004 with an 11 x 11 Gaussian window of 1.5 px, zeros beyond the picture, mean over channels. (The
-    metric that avatars are judged by, `nbavatar.metrics.ssim`, counts complete windows only.)
-    """
-    stacked = torch.stack((pair.image, pair.truth))
-    moments = torch.cat((stacked, stacked.square(), (pair.image * pair.truth)[None]))
-    mean_x, mean_y, square_x, square_y, product = _blur(moments.flatten(0, 1)[:, None]).view(5, 3, *pair.alpha.shape)
-    covariance = product - mean_x * mean_y
-    variances = (square_x - mean_x.square()) + (square_y - mean_y.square())
-    ssim = (2 * mean_x * mean_y + _C1) * (2 * covariance + _C2)
-    ssim = ssim / ((mean_x.square() + mean_y.square() + _C1) * (variances + _C2))
-    return (1.0 - ssim).sum() / (3 * pair.pixels)
 
 
 def _box(content: Tensor, margin: int) -> tuple[slice, slice]:
@@ -90,18 +75,3 @@ def _box(content: Tensor, margin: int) -> tuple[slice, slice]:
         else:
             slices.append(slice(max(0, int(where[0]) - margin), min(size, int(where[-1]) + 1 + margin)))
     return slices[0], slices[1]
-
-
-def _blur(planes: Tensor) -> Tensor:
-    """Gaussian window over planes (B, 1, h, w), zeros beyond."""
-    # One group a plane: torch has a fast kernel for that, and none for one channel in a batch.
-    count, taps = len(planes), _taps(planes.dtype, planes.device).expand(len(planes), 1, _WINDOW)
-    rows = F.conv2d(planes.transpose(0, 1), taps[..., None], padding=(_WINDOW // 2, 0), groups=count)
-    return F.conv2d(rows, taps[:, :, None], padding=(0, _WINDOW // 2), groups=count).transpose(0, 1)
-
-
-@functools.cache
-def _taps(dtype: torch.dtype, device: torch.device) -> Tensor:
-    offsets = torch.arange(_WINDOW, dtype=torch.float64) - _WINDOW // 2
-    taps = torch.exp(-offsets.square() / (2 * _SIGMA**2))
-    return (taps / taps.sum()).to(dtype=dtype, device=device).view(1, 1, _WINDOW)

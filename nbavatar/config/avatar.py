@@ -69,6 +69,11 @@ class TrainConfig:
     neighbours: int = option(3, "K of the neighbour regulariser.", min=1)
     include_self: bool = option(True, "A billboard is its own first neighbour (as in GART and HAHA).")
 
+    weight_mse: float = option(1.0, "Weight of the squared error of colours (the paper's term).", min=0)
+    weight_l1: float = option(0.0, "Weight of the absolute error of colours; not part of the paper.", min=0)
+    weight_dssim: float = option(
+        0.0, "Weight of 1 - SSIM in an 11 px window, at the resolution of the stage; not part of the paper.", min=0
+    )
     weight_lpips: float = option(0.1, "Weight of LPIPS, lambda_lpips.", min=0)
     weight_nb: float = option(0.1, "Weight of the Dice loss of the billboards' silhouette, lambda_NB.", min=0)
     weight_knn: float = option(0.1, "Weight of the neighbour regulariser, lambda_KNN.", min=0)

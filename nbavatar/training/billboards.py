@@ -11,6 +11,7 @@ from nbavatar.avatar.model import Anchor, Avatar
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
+from nbavatar.errors import ConfigError
 from nbavatar.training.adam import Adam
 from nbavatar.training.method import Method, StepLoss
 from nbavatar.training.objective import step_loss
@@ -50,6 +51,9 @@ class BillboardTraining(Method):
         device: str,
     ) -> "BillboardTraining":
         """See `Method.create`."""
+        if max(config.weight_mse, config.weight_l1, config.weight_dssim) == 0:
+            weights = "--cfg.weight_mse, weight_l1, weight_dssim"
+            raise ConfigError.of(weights, expected="one above 0, or no colour is learnt", found="three zeros")
         frames = [sequence.frames[row] for row in sorted({view.row for view in views})]
         avatar = initial_avatar(sequence, coords, frames, config).to(device)
         neighbours = neighbour_graph(avatar, sequence, config)

@@ -1,4 +1,7 @@
-"""The loss of one training step: the terms of the paper on one view (sections 3.3, 3.4 and 4.1)."""
+"""The loss of one training step: the terms of the paper on one view (sections 3.3, 3.4 and 4.1).
+
+Colours are compared by squared error, as in the paper, or by L1 and D-SSIM (`weight_mse`, `weight_l1`, `weight_dssim`).
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from nbavatar.avatar.losses import loss_delta, loss_dice, loss_dice_haha, loss_knn, loss_mse
+from nbavatar.avatar.losses import loss_delta, loss_dice, loss_dice_haha, loss_dssim, loss_knn, loss_l1, loss_mse
 from nbavatar.avatar.model import Anchor, Avatar, Window, compose
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.views import Sample
@@ -30,9 +33,16 @@ class Target(NamedTuple):
 
 
 def target_in(window: Window, sample: Sample) -> Target:
-    """Cut the ground truth to the window of a rendering (zero outside the picture and outside its stored rectangle)."""
+    """Cut the ground truth to the window of a rendering.
+
+    Outside the stored rectangle is background. Where a window reaches over the picture's border there is no truth, and
+    it is ignored.
+    """
     region = window.region
     planes = window.alpha.new_zeros((5, region.height, region.width))
+    _, _, own_rows, own_columns = region.overlap(sample.width, sample.height)
+    planes[4] = 1.0
+    planes[4, own_rows, own_columns] = 0.0
     pixels = sample.pixels.to(planes.device, non_blocking=True)
     height, width = pixels.shape[-2:]
     x0, y0 = max(sample.x0, region.x0), max(sample.y0, region.y0)
@@ -93,8 +103,7 @@ def step_loss(
     nb_alpha = torch.lerp(window.nb_alpha, target.alpha, target.ignored)
 
     pixels = sample.width * sample.height
-    terms = {"mse": loss_mse(image, truth, pixels=pixels)}
-    weights = {"mse": 1.0}
+    terms, weights = _colours(image, truth, pixels, config)
     if lpips is not None and plan.perceptual:
         terms["lpips"] = _perceptual(lpips, image, truth, plan.crop, corner, pixels)
         # Rarer but heavier: the mean pull is the same.
@@ -114,8 +123,22 @@ def step_loss(
     if avatar.refinement is not None:
         terms["refine"] = anchor.penalty
         weights["refine"] = config.refine.weight
-    total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
+    total = torch.stack([weight * terms[name] for name, weight in weights.items()]).sum()
     return total, {name: value.detach() for name, value in terms.items()}, window
+
+
+def _colours(
+    image: Tensor, truth: Tensor, pixels: int, config: TrainConfig
+) -> tuple[dict[str, Tensor], dict[str, float]]:
+    """Terms that compare two pictures pixel by pixel or window by window, and the weights of those that count."""
+    terms = {"mse": loss_mse(image, truth, pixels=pixels)}
+    weights = {"mse": config.weight_mse, "l1": config.weight_l1, "dssim": config.weight_dssim}
+    weights = {name: weight for name, weight in weights.items() if weight > 0}
+    if "l1" in weights:
+        terms["l1"] = loss_l1(image, truth, pixels=pixels)
+    if "dssim" in weights:
+        terms["dssim"] = loss_dssim(image, truth, pixels=pixels)
+    return terms, weights
 
 
 def _perceptual(

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,7 +13,9 @@ from nbavatar.avatar.losses import (
     loss_delta,
     loss_dice,
     loss_dice_haha,
+    loss_dssim,
     loss_knn,
+    loss_l1,
     loss_mse,
 )
 
@@ -22,6 +25,50 @@ def test_loss_mse_equals_hand_value_and_spreads_over_the_whole_picture() -> None
     image[0, 0, 0] = 0.5  # one squared difference of 0.25 among 6 values
     assert loss_mse(image, target).item() == pytest.approx(0.25 / 6)
     assert loss_mse(image, target, pixels=20).item() == pytest.approx(0.25 / 60)
+
+
+def test_loss_l1_equals_hand_value_and_spreads_over_the_whole_picture() -> None:
+    image, target = torch.zeros(3, 1, 2), torch.zeros(3, 1, 2)
+    image[0, 0, 0], image[2, 0, 1] = 0.5, -0.25
+    assert loss_l1(image, target).item() == pytest.approx(0.75 / 6)
+    assert loss_l1(image, target, pixels=20).item() == pytest.approx(0.75 / 60)
+
+
+def plain_dssim(x: np.ndarray, y: np.ndarray, pixels: int) -> float:
+    """1 - SSIM, window after window as Wang et al. 2004 write it (equations 13 to 16), float64, zeros beyond."""
+    offsets = np.mgrid[-5:6, -5:6]
+    weights = np.exp(-(offsets**2).sum(0) / (2 * 1.5**2))
+    weights /= weights.sum()
+    x, y = (np.pad(values, ((0, 0), (5, 5), (5, 5))) for values in (x, y))
+    total = 0.0
+    for c, i, j in np.ndindex(x.shape[0], x.shape[1] - 10, x.shape[2] - 10):
+        a, b = x[c, i : i + 11, j : j + 11], y[c, i : i + 11, j : j + 11]
+        mean_a, mean_b = (weights * a).sum(), (weights * b).sum()
+        spread_a, spread_b = ((weights * (v - m) ** 2).sum() for v, m in ((a, mean_a), (b, mean_b)))
+        shared = (weights * (a - mean_a) * (b - mean_b)).sum()
+        luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
+        total += 1.0 - luminance * (2 * shared + 9e-4) / (spread_a + spread_b + 9e-4)
+    return total / (len(x) * pixels)
+
+
+@pytest.mark.parametrize("size", [(14, 17), (5, 8), (1, 1)])  # smaller than a window too, as coarse stages may be
+def test_loss_dssim_equals_plain_windows_in_value_and_gradient(rng, size: tuple[int, int]) -> None:
+    x, y = (rng.uniform(size=(3, *size)) for _ in range(2))
+    x[:, :1], y[:, :1] = 0.25, 0.5  # flat places too
+    found = torch.from_numpy(x).requires_grad_()
+    loss = loss_dssim(found, torch.from_numpy(y), pixels=400)
+    loss.backward()
+    assert loss.item() == pytest.approx(plain_dssim(x, y, 400), rel=1e-10)
+    narrow = torch.from_numpy(x).float().requires_grad_()
+    loss_dssim(narrow, torch.from_numpy(y).float(), pixels=400).backward()
+    largest = found.grad.abs().max()
+    assert (narrow.grad - found.grad).abs().max() < 1e-4 * largest  # differences of moments lose three of seven digits
+    for place in {(0, 0, 0), (1, size[0] // 2, size[1] // 2), (2, size[0] - 1, size[1] - 1)}:
+        step = np.zeros_like(x)
+        step[place] = 1e-5
+        slope = (plain_dssim(x + step, y, 400) - plain_dssim(x - step, y, 400)) / 2e-5
+        assert found.grad[place].item() == pytest.approx(slope, rel=1e-6, abs=1e-9)
+    assert loss_dssim(found, found).item() == pytest.approx(0.0, abs=1e-12)
 
 
 def test_loss_dice_of_all_ones_is_not_free() -> None:

@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 
 from nbavatar.baselines.density import Statistics, densify
 from nbavatar.baselines.gaussian_avatars import GaussianAvatars
-from nbavatar.baselines.losses import Pair, compare, dssim
+from nbavatar.baselines.losses import Pair, compare
 from nbavatar.baselines.splatting_avatar import SplattingAvatar
 from nbavatar.baselines.splatting_avatar_training import nearest_distances, sample_surface
 from nbavatar.baselines.training import Calendar, camera_extent
@@ -170,14 +170,14 @@ def test_losses_in_the_box_are_those_of_the_whole_picture() -> None:
     whole = Pair(image, truth, alpha, 60 * 70)
     torch.testing.assert_close(pair.l1(), (image - truth).abs().mean())
     torch.testing.assert_close(pair.mse(), (image - truth).square().mean())
-    torch.testing.assert_close(dssim(pair), dssim(whole), atol=1e-6, rtol=0)
+    torch.testing.assert_close(pair.dssim(), whole.dssim(), atol=1e-6, rtol=0)
     # The content is 11 px off the border, where every way to pad sees two equal pictures: scikit-image's value.
     expected = structural_similarity(
         image.double().numpy(), truth.double().numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
         data_range=1.0, channel_axis=0, full=True,
     )[1].mean()  # fmt: skip
-    assert 1.0 - float(dssim(whole)) == pytest.approx(expected, abs=2e-5)
-    assert float(dssim(Pair(truth, truth, alpha, 60 * 70))) == pytest.approx(0, abs=1e-6)
+    assert 1.0 - float(whole.dssim()) == pytest.approx(expected, abs=2e-5)
+    assert float(Pair(truth, truth, alpha, 60 * 70).dssim()) == pytest.approx(0, abs=1e-6)
 
 
 def test_calendar_keeps_published_intervals_or_scales_them() -> None:

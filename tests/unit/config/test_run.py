@@ -56,7 +56,8 @@ def test_paper_keeps_the_papers_settings():
     train = stage_options(load_run(_read("paper")), "train", "full")
     expected = {
         "channels": 6, "texels": 16, "weight_lpips": 0.1, "weight_nb": 0.1, "weight_knn": 0.1, "weight_delta": 0.001,
-        "schedule": "paper", "deferred": True, "init": "spectral", "lpips_crop": 256,
+        "schedule": "paper", "deferred": True, "init": "spectral", "lpips_crop": 256, "weight_mse": 1.0,
+        "weight_l1": 0.0, "weight_dssim": 0.0,
     }  # fmt: skip
     assert {key: train[key] for key in expected} == expected
     rates = {"renderer": 1e-3, "features": 5e-4, "alpha": 5e-4, "rotation": 1e-3, "scale": 5e-3, "position": 1.6e-4}
