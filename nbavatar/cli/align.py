@@ -67,13 +67,11 @@ def main(args: argparse.Namespace) -> None:
             for part, motion in align_block(verts, faces, cameras, read, cfg).items():
                 found[part][rows] = np.concatenate([motion.turn, motion.shift], axis=1)
                 motions[part].append(motion)
-    if pieces and not any(np.isfinite(motion.before) for done in motions.values() for motion in done):
-        if not _in_view(sequence, cameras):
-            raise DataError.of(
-                args.meshes, expected=f"vertices that project into the images of {', '.join(packs)}", found="none",
-                fix="see `nbavatar check`; {\"iterations\": 0} aligns nothing",
-            )  # fmt: skip
-        print("no vertex is seen in two frames or more: there is nothing to compare, and the meshes stay as they came")
+    compared = {part: any(np.isfinite(motion.before) for motion in done) for part, done in motions.items() if done}
+    if compared and not any(compared.values()):
+        raise _nothing_to_compare(args.meshes, sequence, cameras)
+    for part in (part for part, seen in compared.items() if not seen):
+        print(f"{part}: no vertex is seen in two frames or more: there is nothing to compare, and it stays as it came")
     report = {part: summary(done) for part, done in motions.items() if done}
     for part, said in report.items():
         shift, turn = said["shift_mm"], said["turn_deg"]
@@ -94,6 +92,18 @@ def _rows(sequence: MeshSequence, cfg: AlignConfig) -> list[int]:
     if "split" not in sequence.extras:
         raise DataError.of("meshes", "split", expected="which frames are trained on", found="nothing")
     return np.flatnonzero(np.asarray(sequence.extras["split"]).astype(str) == "train").tolist()
+
+
+def _nothing_to_compare(meshes: str, sequence: MeshSequence, cameras: list[Camera]) -> DataError:
+    """Why no vertex of any part could be followed from one frame to another."""
+    if _in_view(sequence, cameras):
+        expected = "a vertex that one camera sees in two frames or more of an uncut run"
+    else:
+        expected = f"vertices that project into the images of {', '.join(camera.name for camera in cameras)}"
+    fix = (
+        'see `nbavatar check`; where it is meant, the option {"iterations": 0} of `align` leaves the meshes as they are'
+    )
+    return DataError.of(meshes, expected=expected, found="none", fix=fix)
 
 
 def _in_view(sequence: MeshSequence, cameras: list[Camera]) -> bool:

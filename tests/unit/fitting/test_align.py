@@ -221,3 +221,28 @@ def test_verb_stops_where_no_part_is_in_any_image(scene: Scene, tmp_path) -> Non
     with pytest.raises(DataError, match="expected vertices that project into the images of a, b, c, found none"):
         _run(tmp_path, packs, {"iterations": 2})
     assert not (tmp_path / "out.npz").exists()
+
+
+def test_verb_stops_where_nothing_is_seen_twice_and_notes_a_part_that_is_not(scene: Scene, tmp_path, capsys) -> None:
+    packs = _write(scene, tmp_path, split=["train"] * FRAMES)
+    sequence, record = read_sequence(tmp_path / "meshes.npz")
+    head = sequence.parts["head"]
+    # A run of one frame has nothing to be compared with, however well it is seen.
+    alone = sequence.subset(sequence.frames[:1])
+    write_sequence(
+        tmp_path / "meshes.npz", dataclasses.replace(alone, extras=alone.extras | {"segments": [[0, 0]]}), {}
+    )
+    with pytest.raises(
+        DataError, match=r"expected a vertex that one camera sees in two frames.*found none.*iterations"
+    ):
+        _run(tmp_path, packs, {"iterations": 2})
+    assert not (tmp_path / "out.npz").exists()
+    # A hand that is there once is left, and said; the head is aligned.
+    once = np.full_like(head.verts, np.nan)
+    once[2] = head.verts[2] + np.float32(0.2)
+    parts = {"head": head, "right_hand": dataclasses.replace(head, verts=once)}
+    write_sequence(tmp_path / "meshes.npz", dataclasses.replace(sequence, parts=parts), record)
+    after = _run(tmp_path, packs, {"iterations": 2})
+    said = capsys.readouterr().out
+    assert "right_hand: no vertex is seen in two frames" in said and "head: no vertex" not in said
+    assert after.extras["align.head"].any() and not after.extras["align.right_hand"].any()
