@@ -6,7 +6,8 @@
     --out       STEM.json (record), STEM.csv (one line a setting), STEM.png and STEM.pdf (plot)
 
 Crop and padding, sequence or frame box, background, resize filter and mask change one at a time; stored images are
-judged anew, nothing is rendered. Half sizes need images of 62 px or more (LPIPS by AlexNet: 31 px a side).
+judged anew, nothing is rendered. Images that show nobody are left out, as in evaluation. Half sizes need 62 px or more
+(LPIPS by AlexNet: 31 px a side).
 """
 
 import argparse
@@ -14,6 +15,7 @@ import csv
 import io
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from nbavatar.cli.common import progress
 from nbavatar.cli.evaluate import read_protocol
@@ -25,6 +27,9 @@ from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import write_json
 from nbavatar.provenance import run_record
+
+if TYPE_CHECKING:
+    import numpy as np
 
 __all__ = ["add_arguments", "main"]
 
@@ -46,6 +51,7 @@ def main(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         stack.enter_context(lease_device("cpu"))
         from nbavatar.evaluation.sensitivity import Images, foreground_box, sweep
+        from nbavatar.evaluation.truth import showing_someone
         from nbavatar.metrics.lpips import load_lpips
         from nbavatar.reporting.figures import save_figure, sensitivity_figure
         from nbavatar.reporting.pictures import spread
@@ -74,7 +80,11 @@ def main(args: argparse.Namespace) -> int:
             rgb = blank_unseen(render.read("rgb", name), unseen, protocol.background)
             return Images(camera, rgb, opacity, pack.read("rgb", frame), pack.read("alpha", frame))
 
-        names = spread(render.frames, args.max_frames)
+        def truth(name: str) -> "np.ndarray":
+            camera, _, frame = name.partition("/")
+            return truths[camera].read("alpha", frame)
+
+        names = spread(showing_someone(render.frames, truth), args.max_frames)
         nets = {net: load_lpips(net) for net in args.nets}
         rows = sweep((images(n) for n in progress(names, "sensitivity")), protocol.background, nets, boxes)
     config = {"protocol": to_mapping(protocol), "nets": args.nets, "max_frames": args.max_frames}

@@ -267,13 +267,15 @@ def _shots(
     args: argparse.Namespace, sheet: TradeoffConfig, protocol: ProtocolConfig, sequence: Any, parts: list[str],
     packs: list[FramePack], net: Any, device: str,
 ) -> tuple[list[Any], tuple[int, int]]:  # fmt: skip
-    """The held-out pictures, evenly spaced over cameras and time, and their size [px]."""
+    """The held-out pictures that show someone, evenly spaced over cameras and time, and their size [px]."""
     from nbavatar.data.views import views_of
     from nbavatar.evaluation.protocols import select_frames
+    from nbavatar.evaluation.truth import showing_someone
     from nbavatar.tradeoff.measure import prepare_shots
 
     splits = [select_frames(pack.frames, pack.manifest.get("split", {}), protocol.split) for pack in packs]
     views = views_of(packs, sequence.frames, splits, layers=("rgb", "alpha"))
+    views = showing_someone(views, lambda view: packs[view.pack].read("alpha", view.frame))
     chosen = [views[i] for i in _evenly(len(views), sheet.images)]
     size = chosen[0].width, chosen[0].height
     for view in chosen:

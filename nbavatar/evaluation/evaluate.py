@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from nbavatar.errors import DataError
+from nbavatar.evaluation.truth import foreground, nobody
 from nbavatar.metrics.lpips import LPIPS
 from nbavatar.metrics.psnr import psnr
 from nbavatar.metrics.ssim import WINDOW, ssim_map
@@ -211,7 +212,7 @@ def _evaluate(
         seen["prediction"].update(where.encode() + pair.prediction.tobytes())
         seen["truth"].update(where.encode() + pair.rgb.tobytes() + pair.alpha.tobytes())
         truth = _tensor(composite(pair.rgb, pair.alpha, background), device)
-        mask = torch.from_numpy(pair.alpha >= foreground_threshold * 255)[None].to(device)
+        mask = torch.from_numpy(foreground(pair.alpha, foreground_threshold))[None].to(device)
         with torch.inference_mode():
             features = {name: net.features(truth) for name, net in nets.items()}
         prediction = _tensor(pair.prediction.astype(np.float32) / np.float32(255), device)
@@ -234,10 +235,7 @@ def _evaluate(
         raise DataError.of("render", expected="one image or more", found="none")
     empty = sum(item["psnr"] is None for item in per_image)
     if empty == len(per_image):
-        raise DataError.of(
-            "truth", "alpha", expected="someone in one of its images at least", found=f"{empty} images of background",
-            fix="look at the masks: is their foreground 255, their coverage a half or more?",
-        )  # fmt: skip
+        raise nobody(empty)
     return {
         "per_image": per_image,
         "metrics": _means(per_image),

@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from nbavatar.evaluation.evaluate import PSNR_CAP
+from nbavatar.evaluation.truth import foreground
 from nbavatar.metrics.lpips import LPIPS
 from nbavatar.metrics.psnr import psnr
 from nbavatar.metrics.ssim import ssim
@@ -84,8 +86,8 @@ def settings(*, opacity: bool) -> list[Setting]:
 
 
 def foreground_box(alpha: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Tight box x0, y0, x1, y1 [px] of coverage above one half; None without foreground."""
-    ys, xs = np.nonzero(alpha > 127)
+    """Tight box x0, y0, x1, y1 [px] of coverage of one half or more; None without foreground."""
+    ys, xs = np.nonzero(foreground(alpha))
     return (float(xs.min()), float(ys.min()), float(xs.max() + 1), float(ys.max() + 1)) if len(xs) else None
 
 
@@ -143,7 +145,7 @@ def sweep(
             box = boxes.get(images.camera) if setting.crop == "sequence" else foreground_box(images.alpha)
             x, y = (_tensor(image) for image in apply_setting(setting, images, background, box))
             with torch.inference_mode():
-                values = {"psnr": min(float(psnr(x, y)), 100.0), "ssim": float(ssim(x, y))}
+                values = {"psnr": min(float(psnr(x, y)), PSNR_CAP), "ssim": float(ssim(x, y))}
                 values |= {f"lpips_{name}": float(net(x, y)) for name, net in nets.items()}
             totals.setdefault(setting, []).append(values)
     rows: list[dict[str, object]] = []
@@ -160,7 +162,7 @@ def _masked(alpha: np.ndarray, kind: str) -> np.ndarray:
     if kind == "soft":
         return alpha
     if kind == "hard":
-        return np.where(alpha > 127, 255, 0).astype(np.uint8)
+        return np.where(foreground(alpha), 255, 0).astype(np.uint8)
     from PIL import Image, ImageFilter
 
     reach = 2 * max(1, round(_GROW * min(alpha.shape))) + 1

@@ -26,6 +26,7 @@ from nbavatar.camera.pinhole import scale_intrinsics
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
 from nbavatar.evaluation.evaluate import PSNR_CAP, composite, measure
+from nbavatar.evaluation.truth import foreground
 from nbavatar.metrics.lpips import LPIPS
 from nbavatar.metrics.psnr import psnr
 from nbavatar.tradeoff.reduce import avatar_bytes
@@ -114,7 +115,7 @@ def prepare_shots(
             Shot(
                 verts, view, view.viewmat.to(device), view.K.to(device), view.frame if refined else None,
                 torch.tensor(background, dtype=torch.float32, device=device), truth,
-                torch.from_numpy(alpha >= 128)[None].to(device),
+                torch.from_numpy(foreground(alpha))[None].to(device),
                 None if unseen is None else torch.from_numpy(unseen).to(device), features,
             )
         )  # fmt: skip

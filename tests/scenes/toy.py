@@ -6,7 +6,7 @@ import numpy as np
 
 from nbavatar.data.sequences import MeshSequence, Part, write_sequence
 from nbavatar.io.arrays import write_arrays
-from nbavatar.io.framepack import FramePackWriter
+from nbavatar.io.framepack import FramePack, FramePackWriter
 
 SIZE = 32
 FRAMES = ["f0", "f1", "f2", "f3"]
@@ -82,3 +82,19 @@ def write_scene(folder: Path, *, size: int = SIZE, empty: bool = False, meshes: 
                 writer.add("alpha", frame, alpha * (not empty))
                 writer.add("label", frame, label * (not empty))
     return {"packs": packs, "meshes": folder / "meshes.npz", "spectral": folder / "spectral.npz"}
+
+
+def rewritten(source, target, frames, *, hide=(), shown_as=lambda rgb, alpha: rgb, prefix=""):
+    """A copy of a pack with some frames only, all to train on, some of them showing nobody; its path."""
+    with FramePack(source) as pack:
+        manifest = {**pack.manifest, "frames": [prefix + frame for frame in frames]}
+        manifest["segments"] = [[0, len(frames) - 1]]
+        manifest["split"] = dict.fromkeys(manifest["frames"], "train")
+        with FramePackWriter(target, manifest) as writer:
+            for frame in frames:
+                rgb, alpha = pack.read("rgb", frame), pack.read("alpha", frame)
+                alpha = alpha * (frame not in hide)
+                writer.add("rgb", prefix + frame, shown_as(rgb, alpha))
+                writer.add("alpha", prefix + frame, alpha)
+                writer.add("label", prefix + frame, pack.read("label", frame) * (frame not in hide))
+    return str(target)

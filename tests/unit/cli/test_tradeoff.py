@@ -12,7 +12,7 @@ from nbavatar.cli import tradeoff
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import read_json
-from tests.scenes.toy import SIZE, write_scene
+from tests.scenes.toy import SIZE, rewritten, write_scene
 
 SHEET = {
     "exact": {"roi": False},
@@ -167,3 +167,20 @@ def test_savings_are_measured_on_and_off(measured) -> None:
     text = (measured["folder"] / "out" / "savings.md").read_text()
     assert "None" not in text and text.count("\n") == len(rows) + 2
     assert all(row["on_ms"] > 0 and row["off_ms"] > 0 for row in rows)
+
+
+def test_pictures_that_show_nobody_are_not_judged(measured, tmp_path, capsys) -> None:
+    sheet = json.dumps({**SHEET, "knobs": {}, "images": 3, "repeats": 1})
+
+    def points(name: str, frames: list[str], hide: list[str]) -> int:
+        truth = rewritten(measured["packs"][2], tmp_path / f"{name}.zip", frames, hide=hide)
+        words = ["--model", measured["model"], *measured["common"], "--frames", truth, "--sheet", sheet, "--no-store"]
+        return cli(["tradeoff", *words, "--train-frames", *measured["packs"][:2], "--out", str(tmp_path / name)])
+
+    assert points("with", ["f0", "f1", "f2"], ["f1"]) == points("without", ["f0", "f2"], []) == 0
+    found = [read_json(tmp_path / name / "tradeoff.json") for name in ("with", "without")]
+    assert [one["images"] for one in found] == [2, 2]
+    judged = ("psnr", "psnr_fg", "ssim", "lpips", "psnr_apart")
+    assert [found[0]["points"][0][key] for key in judged] == [found[1]["points"][0][key] for key in judged]
+    assert points("nobody", ["f0", "f1"], ["f0", "f1"]) == 2
+    assert "expected someone in one of its images at least, found 2 images" in capsys.readouterr().err
