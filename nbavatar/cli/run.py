@@ -8,8 +8,8 @@ The first call copies the configuration files (`config/`) and the page that says
 (`resources/README.md`) into this folder, where you can edit them; files that are there already are left as they are.
 Results go to `results/<run>/`, logs to `logs/<run>/`. The same command again does only what is not done yet. What
 follows `--` goes to snakemake: `-- -n` shows what would run, `-- subject_S2` makes one subject, `-- --configfile FILE`
-takes other options. What a run that was killed has left, processes and Snakemake's lock, is cleared away first. Needs
-the packages of the extra `pipeline`.
+takes other options. Configuration files are read first, and refused in one line where they are none. What a run that
+was killed has left, processes and Snakemake's lock, is cleared away first. Needs the packages of the extra `pipeline`.
 """
 
 import argparse
@@ -22,6 +22,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from nbavatar.cli.run_words import check_files, read_words
 from nbavatar.cli.supervision import run_workflow, wait
 from nbavatar.errors import DataError, DependencyError
 from nbavatar.packages import install_line
@@ -67,13 +68,14 @@ def main(args: argparse.Namespace) -> int:
     source, here = pipeline_folder(), Path.cwd()
     for path in copy_configuration(source, here):
         print(f"{path}: written, yours to edit")
+    words = _snakemake(args, source)
     if args.what == "paper":
         check = [*_OURSELVES, "check", "--layout", "decaf", "resources/DecafDataset"]
         code = wait(subprocess.Popen(check))
         if code:
             return code
     # The jobs of the smoke run take a second or two each: the profile and `nbavatar warm` are for such.
-    code = run_workflow(_snakemake(args, source), warm=args.what == "smoke")
+    code = run_workflow(words, warm=args.what == "smoke")
     report = here / "results" / args.what / "report" / "index.html"
     if code == 0 and report.is_file() and not args.snakemake:
         if args.what == "smoke":
@@ -89,11 +91,15 @@ def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:
     if args.what == "smoke":
         words += ["--workflow-profile", str(source / "profiles" / "ci")]
     words += args.snakemake
-    if "--configfile" not in args.snakemake:
-        words += ["--configfile", f"config/{args.what}.yaml"]
+    given = read_words(args.snakemake)
+    configfiles = given.configfiles or (f"config/{args.what}.yaml",)
+    check_files(given, configfiles, source)
+    if not given.configfiles:
+        words += ["--configfile", *configfiles]
     if args.what == "capture":
-        # As a quoted text: snakemake reads values as YAML, where a folder may look like a number.
-        words += ["--config", f"data_root={json.dumps(args.folder, ensure_ascii=False)}"]
+        # As a quoted text: snakemake reads values as YAML, where a folder may look like a number. Of two `--config`
+        # it takes the last.
+        words += ["--config", *given.values, f"data_root={json.dumps(args.folder, ensure_ascii=False)}"]
     return words
 
 

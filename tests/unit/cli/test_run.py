@@ -128,3 +128,52 @@ def test_an_interrupt_leaves_the_command_time_to_end(tmp_path):
         time.sleep(0.1)
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(timeout=60) == 3 and (tmp_path / "ended").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "words", "said"),
+    [
+        (b"stages:\n  train: {steps: 5}\n\xff\xfe", ["--configfile", "own.yaml"], "own.yaml: expected a configuration"),
+        (b"stages: [1, {\n", ["--configfile=own.yaml"], "own.yaml: expected YAML, found text that does not parse"),
+        (b"stages:\n\ttrain: 1\n", ["--configfiles", "config/capture.yaml", "own.yaml"], "own.yaml: expected YAML"),
+        (b"", ["--configfile", "own.yaml"], "own.yaml: expected a mapping of options, found None"),
+        (b"- 1\n", ["--configfile", "own.yaml"], "own.yaml: expected a mapping of options"),
+        (b"", ["--configf", "own.yaml"], "words for snakemake: ambiguous option"),
+        (b"a: &a [*a]\n", ["--configfile", "own.yaml"], "own.yaml: expected values that end"),
+        (b"run: x\nstages: {trian: {}}\n", ["--configfile", "own.yaml"], "did you mean 'train'?"),
+        (b"__use_yte__: true\nrun: ?open('pwned', 'w').name\n", ["--configfile", "own.yaml"], "unknown key"),
+        (b"", ["-n", "--configfile", "nowhere.yaml"], "a configuration in YAML, found no such file"),
+        (b"jobs: [\n", ["--workflow-profile", "own.yaml"], "own.yaml: expected YAML"),
+        (b"rule all:\n    # \xe9\n", ["-s", "own.yaml"], "own.yaml: expected a Snakefile, found one that is no text"),
+    ],
+)  # fmt: skip
+def test_a_configuration_that_is_none_is_one_line_before_anything_starts(
+    calls, tmp_path, monkeypatch, capsys, content, words, said
+):
+    monkeypatch.chdir(tmp_path)
+    Path("data").mkdir()
+    Path("own.yaml").write_bytes(content)
+    assert main(["run", "capture", "data", "--cores", "1", "--", *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("nbavatar run: error: ") and said in line
+    assert not calls and not Path("pwned").exists()
+
+
+def test_our_own_configuration_is_read_first_too(calls, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("config").mkdir()
+    Path("config/smoke.yaml").write_bytes(b"\x00\xff")
+    assert main(["run", "smoke"]) == 2
+    assert "config/smoke.yaml: expected a configuration in YAML" in capsys.readouterr().err and not calls
+
+
+def test_values_for_the_configuration_stay_beside_the_folder(calls, tmp_path, monkeypatch):
+    """Of two `--config` snakemake takes the last; a file that names no run lies over the paper's."""
+    monkeypatch.chdir(tmp_path)
+    Path("data").mkdir()
+    Path("own.yaml").write_text("tradeoff: {variants: [full]}\n", encoding="utf-8")
+    words = ["--config", "run=mine", "device=cpu", "--configfile=own.yaml"]
+    assert main(["run", "capture", "data", "--", *words]) == 0
+    assert calls[-1][-4:] == ["--config", "run=mine", "device=cpu", 'data_root="data"']
+    assert sum(word.startswith("--configfile") for word in calls[-1]) == 1
+    assert main(["run", "capture", "data", "--", "--configfile", "own.yaml"]) == 0
