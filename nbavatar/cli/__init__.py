@@ -41,6 +41,7 @@ VERBS = {
     "figure": "one figure for print: comparisons, features, cross-reenactment, contact, curves, Pareto fronts",
     "reenact": "drive one subject by another's poses",
     "video": "a turntable or a driven sequence as mp4",
+    "export": "an avatar or its meshes as .ply, .glb, .obj, .safetensors or .onnx",
     "report": "one self-contained HTML page with tables and pictures",
     "tradeoff": "speed against quality of an avatar, setting by setting; presets",
     "extremes": "every numerical kernel at its limits, against an oracle: exact, degrades or refuses",

@@ -13,7 +13,7 @@ from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
 from nbavatar.errors import DataError
 
-__all__ = ["Picture", "check_parts", "render_views"]
+__all__ = ["Picture", "check_parts", "posed_vertices", "render_views"]
 
 
 class Picture(NamedTuple):
@@ -43,6 +43,14 @@ def check_parts(avatar: MeshAvatar, sequence: MeshSequence) -> None:
             raise DataError.of("meshes", f"{part}.faces", expected=expected, found="other faces")
 
 
+def posed_vertices(avatar: MeshAvatar, sequence: MeshSequence, row: int, device: str = "cpu") -> dict[str, Tensor]:
+    """Vertices of one frame, by part of the avatar: float32 (V, 3) [m], NaN where the part is not in the frame."""
+    return {
+        part: torch.from_numpy(np.asarray(sequence.parts[part].verts[row], dtype=np.float32)).to(device)
+        for part in avatar.parts
+    }
+
+
 def _keys(faces: np.ndarray, vertices: int) -> np.ndarray:
     """One number for each face (F, 3), different for different rows of indices below `vertices`."""
     return faces.astype(np.int64) @ np.array([vertices**2, vertices, 1])
@@ -69,10 +77,7 @@ def render_views(
     # Frames of a reenactment may bear the names of training frames, and are none.
     refined = protocol.refined and "driver" not in sequence.extras
     for view in views:
-        verts: Mapping[str, Tensor] = {
-            part: torch.from_numpy(np.asarray(sequence.parts[part].verts[view.row], dtype=np.float32)).to(device)
-            for part in avatar.parts
-        }
+        verts: Mapping[str, Tensor] = posed_vertices(avatar, sequence, view.row, device)
         with torch.no_grad():
             image, alpha, nb_alpha = avatar.render(
                 verts,

@@ -15,9 +15,9 @@ _FORMATS = ("PNG", "JPEG", "WEBP")
 
 
 def encode_png(image: np.ndarray, *, level: int = 1) -> bytes:
-    """Encodes uint8 `[H, W]` or `[H, W, 3]` (RGB) as PNG; `level` is zlib's, 1 = fast."""
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise TypeError(f"expected uint8 [H, W] or [H, W, 3], got {image.dtype} {list(image.shape)}")
+    """Encodes uint8 `[H, W]`, `[H, W, 3]` (RGB) or `[H, W, 4]` (straight alpha) as PNG; `level` of zlib, 1 = fast."""
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)):
+        raise TypeError(f"expected uint8 [H, W] or [H, W, 3 or 4], got {image.dtype} {list(image.shape)}")
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(image)).save(stream, "PNG", compress_level=level)
     return stream.getvalue()

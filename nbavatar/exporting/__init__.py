@@ -1,0 +1,1 @@
+"""Avatars and meshes as other programs take them: arrays for `nbavatar export` to write."""
