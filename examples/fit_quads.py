@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from nbavatar.raster import render_billboards
+from nbavatar.rendering.billboards import render_billboards
 
 photo = Image.open(sys.argv[1]).convert("RGB")
 photo.thumbnail((256, 256))

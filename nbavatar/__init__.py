@@ -1,4 +1,5 @@
 """NBAvatar: head avatars with hand-face contact, made of neural billboards."""
+# provenance: neutral, because it holds the version.
 
 __version__ = "0.1.0"
 

@@ -7,6 +7,7 @@ holds between users, there is no folder that somebody else could have prepared, 
 process ends, however it ends. It does not hold between containers with networks of their own. Standard library only,
 and to be called before torch is imported.
 """
+# provenance: neutral, because where it is computed is recorded.
 
 import contextlib
 import errno

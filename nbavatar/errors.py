@@ -4,6 +4,7 @@ Every one of them is caught at the edge of the command line and printed as one
 line, with exit code 2 and no traceback. Anything else that escapes is a defect
 of ours and keeps its traceback.
 """
+# provenance: neutral, because it words what goes wrong.
 
 import contextlib
 import importlib

@@ -5,6 +5,7 @@ devices behind one file. NVML, the driver's library for administration, knows al
 `CUDA_VISIBLE_DEVICES`; CUDA itself is asked where NVML is absent, and where that variable already chooses several, in a
 process of its own, because a process can ask CUDA only once. Standard library only.
 """
+# provenance: neutral, because which GPUs there are says nothing of what is computed on them.
 
 import ctypes
 import os

@@ -2,6 +2,7 @@
 
 The extras are read from this package's own metadata, so that no second list can differ. Standard library only.
 """
+# provenance: neutral, because it words what is not installed.
 
 import re
 from functools import cache

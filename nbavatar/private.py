@@ -4,6 +4,7 @@ In a folder such as `/tmp` anybody can put a folder, or a symbolic link, under t
 is read from there may be code (Numba unpickles its index), and what is written through a link lands in somebody's
 file. So a place is used only if nobody else could have prepared it. Standard library only.
 """
+# provenance: neutral, because it says where files may lie.
 
 import contextlib
 import os

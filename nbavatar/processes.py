@@ -2,6 +2,7 @@
 
 Standard library only.
 """
+# provenance: neutral, because it names and ends processes.
 
 import contextlib
 import hashlib

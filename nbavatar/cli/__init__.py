@@ -3,6 +3,7 @@
 Each verb is one module of this package with `add_arguments(parser)` and `main(args)`. Only the verb that was
 asked for is imported, so `nbavatar --help` and light stages start at once.
 """
+# provenance: neutral, because it parses arguments.
 
 import argparse
 import contextlib

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Runs one benchmark and prints its figures."""
-    module = importlib.import_module(f"nbavatar.benchmarks.{args.kernel}")
+    module = importlib.import_module(f"nbavatar.studies.benchmarks.{args.kernel}")
     parser = argparse.ArgumentParser(
         prog=f"nbavatar bench {args.kernel}",
         description=module.__doc__,

@@ -20,20 +20,20 @@ from pathlib import Path
 
 import numpy as np
 
+from nbavatar.checks.capture import CaptureReport, check_capture
+from nbavatar.checks.decaf import SubjectReport, check_subject
+from nbavatar.checks.decaf_inventory import missing_files, missing_message
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import MATTE_THRESHOLD, CheckConfig
 from nbavatar.data.capture import read_mesh, read_rgb
-from nbavatar.data.capture_check import CaptureReport, check_capture
 from nbavatar.data.decaf import CAMERAS, DecafSubject, find_subject
-from nbavatar.data.decaf_check import SubjectReport, check_subject
-from nbavatar.data.decaf_inventory import missing_files, missing_message
-from nbavatar.data.supplied_masks import supplied_masks
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import write_json
 from nbavatar.names import check_name
+from nbavatar.preprocess.supplied_masks import supplied_masks
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
@@ -129,9 +129,9 @@ def _check_decaf(root: Path, wanted: dict[str, list[str]], out: Path | None) -> 
 
 def _write_decaf_sheet(subject: DecafSubject, report: SubjectReport, path: Path) -> None:
     """The first frame of every camera, bare and under the posed meshes as the lens sees them."""
-    from nbavatar.data.overlays import mesh_over_image
-    from nbavatar.image.overlay import contact_sheet
+    from nbavatar.checks.overlays import mesh_over_image
     from nbavatar.io.video import read_video
+    from nbavatar.preprocess.overlay import contact_sheet
 
     assert report.sequence is not None
     meshes = {name: (part.verts[0], part.faces) for name, part in report.sequence.parts.items()}
@@ -191,7 +191,7 @@ def _overview(report: CaptureReport) -> list[list[tuple[str, np.ndarray]]]:
 
 def _overlays(report: CaptureReport, name: str, frames: list[str]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """(frame, image, image under its meshes with the outline of its mask) of the frames that can be read."""
-    from nbavatar.data.overlays import mesh_over_image
+    from nbavatar.checks.overlays import mesh_over_image
 
     assert report.capture is not None
     camera = report.capture.cameras[name]
@@ -207,7 +207,7 @@ def _overlays(report: CaptureReport, name: str, frames: list[str]) -> Iterator[t
 
 
 def _write_sheet(rows: list[list[tuple[str, np.ndarray]]], path: Path, cell: int = _CELL) -> None:
-    from nbavatar.image.overlay import contact_sheet
+    from nbavatar.preprocess.overlay import contact_sheet
 
     with atomic_write(path) as temporary:
         temporary.write_bytes(encode_png(contact_sheet(rows, cell=cell), level=6))

@@ -1,4 +1,5 @@
 """What several verbs share: the `--cfg` option, the run's progress bar."""
+# provenance: neutral, because it reads options, which are recorded, and shows progress.
 
 import argparse
 import json
@@ -10,7 +11,7 @@ from nbavatar.config.core import from_mapping
 from nbavatar.config.yamlfiles import read_yaml
 from nbavatar.errors import ConfigError, parsing
 
-__all__ = ["add_cfg_argument", "progress", "read_mapping", "stage_config", "training_preset"]
+__all__ = ["add_cfg_argument", "progress", "read_mapping", "stage_config"]
 
 T = TypeVar("T")
 Item = TypeVar("Item")
@@ -54,27 +55,6 @@ def progress(items: Iterable[Item], description: str, total: int | None = None) 
     from tqdm import tqdm
 
     return tqdm(items, desc=description, total=total, dynamic_ncols=True, mininterval=0.5)
-
-
-def training_preset(name: str, path: str | None, cfg: T) -> T:
-    """Training options with what a measured preset says of order, precision and window.
-
-    It is resolved here, in a module that no digest of code counts: what a training depends on are its options.
-
-    Args:
-        name: preset.
-        path: presets.json of `nbavatar tradeoff`, of an avatar like the one to be trained.
-        cfg: `TrainConfig`.
-    """
-    from nbavatar.config.core import to_mapping
-    from nbavatar.tradeoff.presets import preset_setting
-
-    if path is None:
-        raise ConfigError.of("--presets", expected="a file, there is no model yet to look beside", found="none")
-    setting = preset_setting(path, name, model=None, device="").setting
-    taken = {key: getattr(setting, key) for key in ("order", "precision", "roi", "roi_margin")}
-    options = to_mapping(cfg) | {key: value for key, value in taken.items() if value is not None}
-    return from_mapping(type(cfg), options, f"--preset {name}")
 
 
 def _mapping(value: Any, where: str) -> dict[str, Any]:

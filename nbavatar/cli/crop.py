@@ -22,13 +22,13 @@ from nbavatar.camera.pinhole import Camera
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import CropConfig
-from nbavatar.data.cropping import crop_extent, frame_boxes, plan_crop
 from nbavatar.data.sequences import read_sequence
-from nbavatar.data.sources import LAYERS
 from nbavatar.errors import ConfigError, DataError
-from nbavatar.image.crop import Window, resize_area, resize_labels
-from nbavatar.image.foreground import estimate_foreground
 from nbavatar.io.framepack import UNSEEN, FramePack, FramePackWriter
+from nbavatar.preprocess.crop import Window, resize_area, resize_labels
+from nbavatar.preprocess.cropping import crop_extent, frame_boxes, plan_crop
+from nbavatar.preprocess.foreground import estimate_foreground
+from nbavatar.preprocess.sources import LAYERS
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]

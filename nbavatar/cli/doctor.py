@@ -95,9 +95,9 @@ def third_party(verb: str) -> set[str]:
 
 def examine(root: Path) -> dict[str, Any]:
     """All findings as plain values; see the module for the keys."""
+    from nbavatar.checks.decaf_inventory import SOURCES
     from nbavatar.cli import VERBS
     from nbavatar.data.decaf import list_subjects
-    from nbavatar.data.decaf_inventory import SOURCES
 
     needed = {verb: third_party(verb) for verb in VERBS if verb != "doctor"}
     packages: dict[str, str | None] = {}

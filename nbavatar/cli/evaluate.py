@@ -27,10 +27,10 @@ from nbavatar.config.core import from_mapping, merge, to_mapping
 from nbavatar.config.evaluation import PROTOCOLS, EvaluateConfig, ProtocolConfig, protocol_hash
 from nbavatar.devices import device_name, lease_device
 from nbavatar.errors import DataError
-from nbavatar.image.crop import blank_unseen
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import write_json
+from nbavatar.preprocess.crop import blank_unseen
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main", "read_protocol"]

@@ -87,10 +87,10 @@ def _record(args: argparse.Namespace) -> dict[str, Any]:
 
 def _whole(args: argparse.Namespace) -> tuple[str, bool]:
     """What depends on no frame; the file, and whether the avatar has a decoder."""
-    from nbavatar.avatar.storage import load_avatar
     from nbavatar.exporting.decoder import decoder_model
     from nbavatar.exporting.tensors import tensor_file
     from nbavatar.io.atomic import atomic_write
+    from nbavatar.methods.storage import load_avatar
 
     avatar = load_avatar(args.model)
     make = tensor_file if args.to == "tensors" else decoder_model
@@ -187,8 +187,8 @@ def _write_meshes(args: argparse.Namespace, sequence: "MeshSequence", rows: list
 
 def _avatar_poses(args: argparse.Namespace, sequence: "MeshSequence", rows: list[int]) -> tuple[Any, Any]:
     """The avatar, and frame and vertices of each row, one after another."""
-    from nbavatar.avatar.storage import load_avatar
     from nbavatar.evaluation.render import check_parts, posed_vertices
+    from nbavatar.methods.storage import load_avatar
 
     avatar = load_avatar(args.model)
     check_parts(avatar, sequence)

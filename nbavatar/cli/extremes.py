@@ -36,11 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Measures, writes tables and pictures, prints what is not exact."""
     with lease_device("cpu"):
-        from nbavatar.extremes.cells import FAMILIES
-        from nbavatar.extremes.plots import curves, heat_map
-        from nbavatar.extremes.table import count_verdicts, csv_text, sweep
         from nbavatar.reporting.extremes import extremes_markdown
         from nbavatar.reporting.figures import save_figure
+        from nbavatar.studies.extremes.cells import FAMILIES
+        from nbavatar.studies.extremes.plots import curves, heat_map
+        from nbavatar.studies.extremes.table import count_verdicts, csv_text, sweep
 
         for name in args.families or ():
             if name not in FAMILIES:

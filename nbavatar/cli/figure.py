@@ -97,8 +97,8 @@ def _draw(args: argparse.Namespace, layout: FigureLayout) -> Drawn:
 
 def _showcase(args: argparse.Namespace, layout: FigureLayout, crops: list[FramePack]) -> tuple:
     # torch is imported for these two kinds only.
-    from nbavatar.avatar.storage import load_avatar
     from nbavatar.evaluation.showcase import show_features, show_reenactment
+    from nbavatar.methods.storage import load_avatar
 
     models = {Path(path).parts[-3]: path for path in args.models if Path(path).parts[-2] == layout.variant}
     avatars = {subject: load_avatar(path) for subject, path in models.items() if layout.shows(subject)}

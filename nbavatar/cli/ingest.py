@@ -24,13 +24,13 @@ from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import IngestConfig
 from nbavatar.data.capture import open_capture
-from nbavatar.data.capture_masks import CameraMasks, open_masks
 from nbavatar.data.decaf import find_subject, read_camera
 from nbavatar.data.frame_plan import manifest_of, plan_capture, plan_decaf
-from nbavatar.data.sources import LAYERS, capture_images, capture_layers, decaf_images
 from nbavatar.errors import ConfigError
 from nbavatar.io.framepack import FramePackWriter
 from nbavatar.names import check_name
+from nbavatar.preprocess.capture_masks import CameraMasks, open_masks
+from nbavatar.preprocess.sources import LAYERS, capture_images, capture_layers, decaf_images
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]

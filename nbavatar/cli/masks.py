@@ -26,15 +26,15 @@ from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import MasksConfig
 from nbavatar.data.capture import open_capture
-from nbavatar.data.capture_masks import CameraMasks, open_masks
-from nbavatar.data.masking import MaskNumbers, MaskStatistics, cut_masks
-from nbavatar.data.part_masks import Margins, PartCutter
 from nbavatar.data.sequences import read_sequence
-from nbavatar.data.sources import LAYERS, capture_layers, frame_masks
-from nbavatar.data.supplied_masks import supplied_masks
 from nbavatar.errors import DataError
-from nbavatar.image.clothes import ClothesModel
 from nbavatar.io.framepack import FramePack, FramePackWriter
+from nbavatar.preprocess.capture_masks import CameraMasks, open_masks
+from nbavatar.preprocess.clothes import ClothesModel
+from nbavatar.preprocess.masking import MaskNumbers, MaskStatistics, cut_masks
+from nbavatar.preprocess.part_masks import Margins, PartCutter
+from nbavatar.preprocess.sources import LAYERS, capture_layers, frame_masks
+from nbavatar.preprocess.supplied_masks import supplied_masks
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]

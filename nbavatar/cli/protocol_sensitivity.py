@@ -22,10 +22,10 @@ from nbavatar.cli.evaluate import read_protocol
 from nbavatar.config.core import to_mapping
 from nbavatar.devices import lease_device
 from nbavatar.errors import DataError
-from nbavatar.image.crop import blank_unseen
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import write_json
+from nbavatar.preprocess.crop import blank_unseen
 from nbavatar.provenance import run_record
 
 if TYPE_CHECKING:

@@ -54,12 +54,12 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _render(args: argparse.Namespace, protocol: ProtocolConfig, device: str) -> int:
-    from nbavatar.avatar.storage import load_avatar
     from nbavatar.data.sequences import read_sequence
     from nbavatar.data.views import views_of
     from nbavatar.evaluation.protocols import select_frames
     from nbavatar.evaluation.render import render_views
     from nbavatar.io.framepack import FramePack, FramePackWriter
+    from nbavatar.methods.storage import load_avatar
 
     avatar = load_avatar(args.model, device)
     sequence, _ = read_sequence(args.meshes)

@@ -47,7 +47,7 @@ from nbavatar.reporting.page import (
     videos_section,
 )
 from nbavatar.reporting.pictures import data_uri, reduce_picture
-from nbavatar.tradeoff.section import offline_section, savings_section, tradeoff_section
+from nbavatar.studies.tradeoff.section import offline_section, savings_section, tradeoff_section
 
 __all__ = ["add_arguments", "main", "read_renders"]
 

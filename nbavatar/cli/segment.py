@@ -38,10 +38,10 @@ from nbavatar.config.detection import SegmentConfig
 from nbavatar.data.capture import Capture, Splits, open_capture, read_rgb, read_splits
 from nbavatar.devices import lease_device
 from nbavatar.errors import ConfigError, DataError
-from nbavatar.image.overlay import contact_sheet, mask_outline
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import write_json
+from nbavatar.preprocess.overlay import contact_sheet, mask_outline
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]

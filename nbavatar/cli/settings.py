@@ -60,8 +60,8 @@ def tuned_avatar(
     import torch
 
     from nbavatar.config.core import to_mapping
-    from nbavatar.tradeoff.presets import budget_setting, preset_setting, presets_path
-    from nbavatar.tradeoff.tuned import TunedAvatar
+    from nbavatar.studies.tradeoff.presets import budget_setting, preset_setting, presets_path
+    from nbavatar.studies.tradeoff.tuned import TunedAvatar
 
     path = args.presets or presets_path(args.model)
     digest, here = file_digest(args.model), timed_device(device)

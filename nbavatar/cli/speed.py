@@ -42,12 +42,12 @@ def main(args: argparse.Namespace) -> int:
     """Runs `nbavatar speed`."""
     config = stage_config(args, SpeedConfig)
     with lease_device(args.device) as device:
-        from nbavatar.avatar.storage import load_avatar
         from nbavatar.data.sequences import read_sequence
         from nbavatar.data.views import views_of
         from nbavatar.evaluation.protocols import select_frames
         from nbavatar.evaluation.speed import measure_speed
         from nbavatar.io.framepack import FramePack
+        from nbavatar.methods.storage import load_avatar
 
         avatar = load_avatar(args.model, device)
         sequence, _ = read_sequence(args.meshes)

@@ -89,9 +89,9 @@ def _offline(args: argparse.Namespace, sheet: TradeoffConfig) -> int:
     from nbavatar.data.sequences import read_sequence
     from nbavatar.io.atomic import atomic_write
     from nbavatar.reporting.figures import save_figure
-    from nbavatar.tradeoff.figures import offline_figure
-    from nbavatar.tradeoff.offline import contact_rows, decimation_rows, refit_rows, spectral_rows
-    from nbavatar.tradeoff.tables import offline_markdown, rows_csv
+    from nbavatar.studies.tradeoff.figures import offline_figure
+    from nbavatar.studies.tradeoff.offline import contact_rows, decimation_rows, refit_rows, spectral_rows
+    from nbavatar.studies.tradeoff.tables import offline_markdown, rows_csv
 
     out = Path(args.out)
     sequence, _ = read_sequence(args.meshes)
@@ -123,8 +123,8 @@ def _sweep(
     from nbavatar.data.sequences import read_sequence
     from nbavatar.evaluation.render import check_parts
     from nbavatar.metrics.lpips import load_lpips
-    from nbavatar.tradeoff.session import Session
-    from nbavatar.tradeoff.sweep import PointLog
+    from nbavatar.studies.tradeoff.session import Session
+    from nbavatar.studies.tradeoff.sweep import PointLog
 
     out = Path(args.out)
     models = _models(args.model, device)
@@ -181,8 +181,8 @@ def _savings(
     sheet: TradeoffConfig, model: Any, sequence: Any, shots: list[Any], chooser: "_Chooser", net: Any, device: str
 ) -> list[dict[str, Any]]:
     """The savings of pictures, and that of the contact stage where the meshes have head and hands."""
-    from nbavatar.tradeoff.contact import contact_only_rows, contact_scene
-    from nbavatar.tradeoff.savings import even_rows, measure_savings
+    from nbavatar.studies.tradeoff.contact import contact_only_rows, contact_scene
+    from nbavatar.studies.tradeoff.savings import even_rows, measure_savings
 
     rows: list[dict[str, Any]] = []
     footprints = chooser.footprints(model)
@@ -194,8 +194,8 @@ def _savings(
 
 
 def _write_savings(out: Path, rows: list[dict[str, Any]], record: dict[str, Any]) -> None:
-    from nbavatar.tradeoff.savings import savings_markdown
-    from nbavatar.tradeoff.tables import rows_csv
+    from nbavatar.studies.tradeoff.savings import savings_markdown
+    from nbavatar.studies.tradeoff.tables import rows_csv
 
     _write(out / "savings.csv", rows_csv(rows))
     _write(out / "savings.md", savings_markdown(rows))
@@ -209,11 +209,11 @@ def _write_results(
 ) -> None:  # fmt: skip
     from nbavatar.io.atomic import atomic_write
     from nbavatar.reporting.figures import save_figure
-    from nbavatar.tradeoff.figures import COSTS, front_figure
-    from nbavatar.tradeoff.front import steadied
-    from nbavatar.tradeoff.presets import preset_entry, presets_path, store_presets
-    from nbavatar.tradeoff.tables import point_rows, points_markdown, rows_csv
-    from nbavatar.tradeoff.words import knob_paragraphs
+    from nbavatar.studies.tradeoff.figures import COSTS, front_figure
+    from nbavatar.studies.tradeoff.front import steadied
+    from nbavatar.studies.tradeoff.presets import preset_entry, presets_path, store_presets
+    from nbavatar.studies.tradeoff.tables import point_rows, points_markdown, rows_csv
+    from nbavatar.studies.tradeoff.words import knob_paragraphs
 
     out = Path(args.out)
     steady = dict(zip(map(id, result.points), points := steadied(result.points), strict=True))
@@ -252,8 +252,8 @@ def _write_results(
 
 def _models(paths: list[str], device: str) -> list[Any]:
     """The avatars, named after the folders they lie in."""
-    from nbavatar.avatar.model import load_avatar
-    from nbavatar.tradeoff.session import Candidate
+    from nbavatar.methods.storage import load_avatar
+    from nbavatar.studies.tradeoff.session import Candidate
 
     names = [Path(path).resolve().parent.name for path in paths]
     if len(set(names)) < len(names):
@@ -271,7 +271,7 @@ def _shots(
     from nbavatar.data.views import views_of
     from nbavatar.evaluation.protocols import select_frames
     from nbavatar.evaluation.truth import showing_someone
-    from nbavatar.tradeoff.measure import prepare_shots
+    from nbavatar.studies.tradeoff.measure import prepare_shots
 
     splits = [select_frames(pack.frames, pack.manifest.get("split", {}), protocol.split) for pack in packs]
     views = views_of(packs, sequence.frames, splits, layers=("rgb", "alpha"))
@@ -314,7 +314,7 @@ class _Chooser:
         """The largest footprint of every billboard [px]."""
         import torch
 
-        from nbavatar.tradeoff.footprint import largest_footprints
+        from nbavatar.methods.billboards.compression.footprint import largest_footprints
 
         meshes = {part: torch.from_numpy(self._sequence.parts[part].verts) for part in model.avatar.parts}
         return largest_footprints(model.avatar, meshes, self._views(), most_views=_SIZING_VIEWS)
@@ -332,7 +332,7 @@ class _Chooser:
         import numpy as np
         import torch
 
-        from nbavatar.tradeoff.session import view_contributions
+        from nbavatar.studies.tradeoff.session import view_contributions
 
         views, shots = self._views(), []
         for index in _evenly(len(views), self._count):

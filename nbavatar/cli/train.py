@@ -20,18 +20,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nbavatar.cli.common import add_cfg_argument, stage_config, training_preset
+from nbavatar.cli.common import add_cfg_argument, stage_config
 from nbavatar.config.avatar import TrainConfig
-from nbavatar.config.core import to_mapping
+from nbavatar.config.core import from_mapping, to_mapping
 from nbavatar.devices import device_name, lease_device, peak_memory_mb
-from nbavatar.errors import DataError
+from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.arrays import read_arrays
 from nbavatar.io.atomic import atomic_write
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
-
-_SAMPLED_VIEWS = 200  # a billboard shows for many frames, so a sample of the views finds it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +52,7 @@ def main(args: argparse.Namespace) -> int:
     """Runs `nbavatar train`; 143 when it was told to terminate (its state is saved)."""
     config = stage_config(args, TrainConfig)
     if args.preset:
-        config = training_preset(args.preset, args.presets, config)
+        config = _with_preset(args.preset, args.presets, config)
     if args.max_minutes is not None:
         config = replace(config, max_minutes=args.max_minutes)
     inputs = {f"frames.{i}": path for i, path in enumerate(args.frames)} | {"meshes": args.meshes}
@@ -79,18 +77,35 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
+def _with_preset(name: str, path: str | None, cfg: TrainConfig) -> TrainConfig:
+    """Training options with what a measured preset says of order, precision and window.
+
+    Args:
+        name: preset.
+        path: presets.json of `nbavatar tradeoff`, of an avatar like the one to be trained.
+        cfg: options so far.
+    """
+    from nbavatar.studies.tradeoff.presets import preset_setting  # provenance: neutral, what it gives becomes options
+
+    if path is None:
+        raise ConfigError.of("--presets", expected="a file, there is no model yet to look beside", found="none")
+    setting = preset_setting(path, name, model=None, device="").setting
+    taken = {key: getattr(setting, key) for key in ("order", "precision", "roi", "roi_margin")}
+    options = to_mapping(cfg) | {key: value for key, value in taken.items() if value is not None}
+    return from_mapping(type(cfg), options, f"--preset {name}")
+
+
 def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any], device: str) -> dict[str, Any]:
     """Reads all inputs, trains, and writes the model last."""
     # torch is imported after the device has been leased.
     import torch
 
-    from nbavatar.avatar.model import Avatar
-    from nbavatar.avatar.storage import save_avatar
     from nbavatar.data.sequences import read_sequence
     from nbavatar.data.views import ViewStore, check_views, views_of
     from nbavatar.io.framepack import FramePack
+    from nbavatar.methods.base import create_method
+    from nbavatar.methods.storage import save_avatar
     from nbavatar.training.loop import train
-    from nbavatar.training.method import create_method
     from nbavatar.training.state import RunFolder
 
     sequence, _ = read_sequence(args.meshes)
@@ -124,17 +139,8 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     )
     bar.close()
     if summary["finished"]:
-        if config.prune_margin is not None and isinstance(avatar, Avatar):
-            from nbavatar.tradeoff.prune import prune
-
-            avatar = prune(avatar, meshes, views, margin=config.prune_margin, most_views=_SAMPLED_VIEWS)
-            summary["primitives"] = avatar.primitives
-        if config.texture_density is not None and isinstance(avatar, Avatar):
-            from nbavatar.tradeoff.footprint import largest_footprints, texels_of
-            from nbavatar.tradeoff.reduce import size_textures
-
-            footprints = largest_footprints(avatar, meshes, views, most_views=_SAMPLED_VIEWS)
-            avatar = size_textures(avatar, texels_of(footprints, config.texture_density))
+        avatar = method.finish(meshes, views)
+        summary["primitives"] = avatar.primitives
         summary |= {"train_seconds": summary["seconds"], "peak_memory_mb": round(peak_memory_mb(device), 1)}
         avatar.record = {**record, "summary": summary, "threads": torch.get_num_threads()}
         if args.history:

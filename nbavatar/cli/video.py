@@ -81,12 +81,12 @@ def _stored(args: argparse.Namespace, cfg: VideoConfig) -> tuple[int, Iterator["
 
 
 def _rendered(args: argparse.Namespace, cfg: VideoConfig, device: str) -> tuple[int, Iterator["np.ndarray"]]:
-    from nbavatar.avatar.storage import load_avatar
     from nbavatar.config.evaluation import ProtocolConfig
     from nbavatar.data.sequences import read_sequence
     from nbavatar.evaluation.orbit import driven_views, turntable_views
     from nbavatar.evaluation.render import check_parts, render_views
     from nbavatar.io.framepack import FramePack
+    from nbavatar.methods.storage import load_avatar
 
     avatar = load_avatar(args.model, device)
     sequence, _ = read_sequence(args.meshes)

@@ -121,7 +121,7 @@ def _load() -> None:
     import nbavatar.evaluation.evaluate
     import nbavatar.evaluation.speed
     import nbavatar.training.loop  # noqa: F401
-    from nbavatar.raster.functional import render_billboards
+    from nbavatar.rendering.billboards.functional import render_billboards
 
     alpha, camera = torch.zeros(1, 1, 1), torch.eye(4)
     place = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 2)

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.avatar.model import Avatar
-from nbavatar.avatar.region import paste
 from nbavatar.data.views import View
 from nbavatar.errors import DataError
+from nbavatar.methods.billboards.avatar import Avatar
+from nbavatar.methods.billboards.region import paste
 
 __all__ = ["feature_pictures", "principal_colours"]
 

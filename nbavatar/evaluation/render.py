@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.avatar.base import MeshAvatar
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
 from nbavatar.errors import DataError
+from nbavatar.methods.base import MeshAvatar
 
 __all__ = ["Picture", "check_parts", "posed_vertices", "render_views"]
 

@@ -5,13 +5,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from nbavatar.avatar.base import MeshAvatar
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.evaluation.features import feature_pictures
 from nbavatar.evaluation.orbit import driven_views
 from nbavatar.evaluation.render import check_parts, render_views
 from nbavatar.io.framepack import FramePack
+from nbavatar.methods.base import MeshAvatar
 
 __all__ = ["Showcase", "show_features", "show_reenactment", "spread_rows"]
 

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from nbavatar.avatar.base import MeshAvatar, Stages
 from nbavatar.config.avatar import SpeedConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
 from nbavatar.devices import peak_memory_mb
 from nbavatar.evaluation.render import check_parts
+from nbavatar.methods.base import MeshAvatar, Stages
 
 __all__ = ["measure_speed"]
 

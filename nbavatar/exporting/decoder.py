@@ -16,9 +16,9 @@ from typing import Any
 
 import torch
 
-from nbavatar.avatar.base import MeshAvatar
-from nbavatar.avatar.model import Avatar
 from nbavatar.errors import DataError, require
+from nbavatar.methods.base import MeshAvatar
+from nbavatar.methods.billboards.avatar import Avatar
 
 __all__ = ["decoder_model"]
 

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.avatar.model import Avatar
 from nbavatar.errors import DataError
 from nbavatar.io.gltf import Shape
 from nbavatar.io.images import encode_png
 from nbavatar.math.rotations import normalize_quaternion, quaternion_to_matrix
+from nbavatar.methods.billboards.avatar import Avatar
 
 __all__ = ["quads"]
 

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.baselines.gaussians import GaussianAvatar
 from nbavatar.errors import DataError
+from nbavatar.methods.gaussians.avatar import GaussianAvatar
 
 __all__ = ["splat_columns"]
 

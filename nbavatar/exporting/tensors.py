@@ -5,9 +5,9 @@ from typing import Any
 
 import torch
 
-from nbavatar.avatar.base import MeshAvatar
-from nbavatar.avatar.storage import FORMAT
 from nbavatar.errors import require
+from nbavatar.methods.base import MeshAvatar
+from nbavatar.methods.storage import FORMAT
 
 __all__ = ["tensor_file"]
 

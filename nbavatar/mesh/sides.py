@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from nbavatar.kernels import stored_njit
+from nbavatar.jit.cache import stored_njit
 
 __all__ = ["faces_across", "on_rim", "sign_distances"]
 

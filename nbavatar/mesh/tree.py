@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from nbavatar.kernels import stored_njit
+from nbavatar.jit.cache import stored_njit
 
 __all__ = ["build_tree", "extent", "in_box", "nearest", "refit", "separated"]
 

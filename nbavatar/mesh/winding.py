@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from nbavatar.kernels import stored_njit
+from nbavatar.jit.cache import stored_njit
 
 __all__ = ["charge", "crossings", "inner_middles", "is_closed", "winding", "winding_plain"]
 

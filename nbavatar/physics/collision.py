@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nbavatar.kernels import stored_njit
+from nbavatar.jit.cache import stored_njit
 from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.mesh.tree import in_box
 

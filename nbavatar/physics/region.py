@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 
-from nbavatar.kernels import stored_njit
+from nbavatar.jit.cache import stored_njit
 from nbavatar.mesh.drawing import vertex_normals
 from nbavatar.physics.tissue import SoftSurface
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from nbavatar.kernels import stored_njit
+from nbavatar.jit.cache import stored_njit
 
 __all__ = ["relax"]
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from nbavatar.image.crop import blank_unseen
 from nbavatar.io.framepack import UNSEEN, FramePack
+from nbavatar.preprocess.crop import blank_unseen
 from nbavatar.reporting.insets import contact_pixels, contact_window, cut
 from nbavatar.reporting.page import Card, Strip
 from nbavatar.reporting.pictures import data_uri, error_map, reduce_picture, spread

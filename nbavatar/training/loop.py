@@ -15,14 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nbavatar.avatar.base import MeshAvatar
 from nbavatar.config.avatar import TrainConfig
 from nbavatar.data.views import ViewStore, ViewStream
 from nbavatar.errors import NBAvatarError
-from nbavatar.training.adam import Adam
-from nbavatar.training.method import Method
+from nbavatar.methods.base import MeshAvatar, Method
+from nbavatar.optimization.adam import Adam
+from nbavatar.optimization.schedule import Plan
 from nbavatar.training.preview import contact_sheet
-from nbavatar.training.schedule import Plan
 
 __all__ = ["Store", "train"]
 

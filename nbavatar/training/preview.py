@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.avatar.base import MeshAvatar
 from nbavatar.data.views import Sample
+from nbavatar.methods.base import MeshAvatar
 
 __all__ = ["contact_sheet"]
 

@@ -71,7 +71,7 @@ def _vertex_maps(path: Path) -> None:
 
 
 def _avatar(path: Path) -> None:
-    from nbavatar.avatar.storage import load_avatar
+    from nbavatar.methods.storage import load_avatar
 
     load_avatar(path)
 
@@ -280,22 +280,22 @@ def _histories(path: Path) -> None:
 
 def _sweep(path: Path) -> None:
     from nbavatar.cli.results import read_sweep
-    from nbavatar.tradeoff.section import offline_section, savings_section, tradeoff_section
+    from nbavatar.studies.tradeoff.section import offline_section, savings_section, tradeoff_section
 
     kind, content = read_sweep(path)
     {"tradeoff": tradeoff_section, "savings": savings_section, "offline": offline_section}[kind](content, "| a |")
 
 
 def _presets(path: Path) -> None:
-    from nbavatar.tradeoff.presets import budget_setting, preset_setting
+    from nbavatar.studies.tradeoff.presets import budget_setting, preset_setting
 
     preset_setting(path, "fast", model="m", device="cpu")
     budget_setting(path, model="m", device="cpu", size=(32, 32), max_ms=5.0, min_psnr=None)
 
 
 def _points(path: Path) -> None:
-    from nbavatar.tradeoff.front import Point
-    from nbavatar.tradeoff.sweep import PointLog
+    from nbavatar.studies.tradeoff.front import Point
+    from nbavatar.studies.tradeoff.sweep import PointLog
 
     known = PointLog(path).get("k0")
     if known is not None:

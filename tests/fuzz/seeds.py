@@ -54,18 +54,18 @@ def vertex_maps(folder: Path) -> Path:
 
 
 def avatar(folder: Path, method: str) -> Path:
-    from nbavatar.avatar.storage import save_avatar
+    from nbavatar.methods.storage import save_avatar
 
     save_avatar(folder / "model.pt", _avatar(method))
     return folder / "model.pt"
 
 
 def _avatar(method: str) -> Any:
-    from nbavatar.avatar.billboards import Billboards
-    from nbavatar.avatar.model import Architecture, Avatar
-    from nbavatar.avatar.refine import Refinement
-    from nbavatar.baselines.gaussian_avatars import GaussianAvatars
-    from nbavatar.baselines.splatting_avatar import SplattingAvatar
+    from nbavatar.methods.billboards.avatar import Architecture, Avatar
+    from nbavatar.methods.billboards.billboards import Billboards
+    from nbavatar.methods.billboards.refine import Refinement
+    from nbavatar.methods.gaussian_avatars.avatar import GaussianAvatars
+    from nbavatar.methods.splatting_avatar.avatar import SplattingAvatar
 
     faces = {"head": torch.from_numpy(toy.OCTAHEDRON_FACES)}
     if method == "gaussian_avatars":

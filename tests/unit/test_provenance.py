@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import nbavatar
-from nbavatar import provenance
+from nbavatar import imports, provenance
 from nbavatar.cli import VERBS
 
 SOURCE = Path(nbavatar.__file__).parent
@@ -16,17 +16,18 @@ SOURCE = Path(nbavatar.__file__).parent
 def copy(tmp_path, monkeypatch):
     """A copy of the package that may be edited, and a function that digests a verb of it afresh."""
     shutil.copytree(SOURCE, tmp_path / "nbavatar", ignore=shutil.ignore_patterns("__pycache__", "assets"))
-    monkeypatch.setattr(provenance, "_ROOT", tmp_path / "nbavatar")
+    monkeypatch.setattr(imports, "ROOT", tmp_path / "nbavatar")
+    caches = (provenance.code_digest, provenance.code_modules, provenance._tree, provenance._normalised,
+              imports.source_of, imports._text, imports.is_neutral, imports.imports_of)  # fmt: skip
 
-    def digest(verb):
-        for function in (provenance.code_digest, provenance.code_modules, provenance._source, provenance._tree,
-                         provenance._normalised):  # fmt: skip
+    def digest(verb, method=None):
+        for function in caches:
             function.cache_clear()
-        return provenance.code_digest(verb)
+        return provenance.code_digest(verb, method)
 
     yield tmp_path / "nbavatar", digest
-    for name in ("code_digest", "code_modules", "_source", "_tree", "_normalised"):
-        getattr(provenance, name).cache_clear()
+    for function in caches:
+        function.cache_clear()
 
 
 def test_every_verb_has_a_digest_of_its_own():
@@ -38,7 +39,7 @@ def test_every_verb_has_a_digest_of_its_own():
 def test_digest_is_blind_to_comments_docstrings_and_layout(copy):
     root, digest = copy
     before = digest("render")
-    path = root / "avatar" / "unet.py"
+    path = root / "methods/billboards/unet.py"
     text = path.read_text()
     path.write_text("# a comment\n\n\n" + text.replace('"""', '"""Reworded. ', 1))
     assert path.read_text() != text
@@ -48,7 +49,7 @@ def test_digest_is_blind_to_comments_docstrings_and_layout(copy):
 def test_digest_sees_an_edit_behind_several_imports_and_only_there(copy):
     root, digest = copy
     before = {verb: digest(verb) for verb in ("train", "render", "table", "crop")}
-    path = root / "raster" / "functional.py"
+    path = root / "rendering/billboards" / "functional.py"
     path.write_text(path.read_text() + "\nEDITED = 1\n")
     after = {verb: digest(verb) for verb in before}
     assert {verb for verb in before if before[verb] != after[verb]} == {"train", "render"}
@@ -57,21 +58,28 @@ def test_digest_sees_an_edit_behind_several_imports_and_only_there(copy):
 def test_digest_follows_backends_that_are_imported_by_name(copy):
     root, digest = copy
     before = digest("train")
-    path = root / "raster" / "cpu.py"
+    path = root / "rendering/billboards" / "cpu.py"
     path.write_text(path.read_text() + "\nEDITED = 1\n")
     assert digest("train") != before
 
 
-def test_dynamic_modules_exist():
-    for names in provenance.DYNAMIC.values():
-        for name in names:
-            assert SOURCE.parent.joinpath(*name.split(".")).with_suffix(".py").is_file(), name
+def test_digest_leaves_out_what_is_marked(copy):
+    """Reworded errors, and the presets that `train` turns into options."""
+    root, digest = copy
+    before = digest("train")
+    for name in ("errors.py", "studies/tradeoff/presets.py"):
+        (root / name).write_text((root / name).read_text() + "\nEDITED = 1\n")
+    assert digest("train") == before
+    text = (root / "cli/train.py").read_text()
+    assert "# provenance: neutral" in text
+    (root / "cli/train.py").write_text(text.replace("# provenance: neutral", "# followed"))
+    assert digest("train") != before
 
 
 def test_every_family_of_extremes_is_followed():
-    from nbavatar.extremes.cells import FAMILIES
+    from nbavatar.studies.extremes.cells import FAMILIES
 
-    assert set(provenance.DYNAMIC["nbavatar.extremes.cells"]) == {f"nbavatar.extremes.{name}" for name in FAMILIES}
+    assert {f"nbavatar.studies.extremes.{name}" for name in FAMILIES} <= set(provenance.code_modules("extremes"))
 
 
 def test_run_record_is_json_with_all_that_traces_a_number(tmp_path):

@@ -118,11 +118,11 @@ def test_comments_and_docstrings_of_the_library_run_nothing(edit):
     def reword(text):
         return "# a remark\n" + text.replace('"""', '"""Reworded: ', 1)
 
-    assert edit("nbavatar/raster/functional.py", reword) == {}
+    assert edit("nbavatar/rendering/billboards/functional.py", reword) == {}
 
 
 def test_an_edit_of_the_rasterizer_retrains_and_leaves_masks_and_crops_alone(edit):
-    plan = edit("nbavatar/raster/reference.py", lambda text: text + "\nEDITED = 1\n")
+    plan = edit("nbavatar/rendering/billboards/reference.py", lambda text: text + "\nEDITED = 1\n")
     assert not set(plan) & {"ingest", "tracks", "masks", "crop", "spectral", "deform"}
     assert {name: plan[name] for name in ("train", "render", "evaluate")} == {"train": 13, "render": 18, "evaluate": 18}
 

@@ -5,10 +5,10 @@ import pytest
 
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import project
+from nbavatar.checks.capture import check_capture
 from nbavatar.cli import main
 from nbavatar.config.sheets import capture_subjects
 from nbavatar.data.capture import open_capture, read_mesh, read_splits, read_topology
-from nbavatar.data.capture_check import check_capture
 from nbavatar.data.foreign.flame_parameters import FlameSequence
 from nbavatar.io.meshfiles import read_mesh_file
 from tests.scenes import foreign

@@ -12,8 +12,8 @@ from PIL import Image
 
 from nbavatar.cli import main
 from nbavatar.data import detector_models
-from nbavatar.data.mask_values import ValueSurvey
 from nbavatar.io.images import decode_image
+from nbavatar.preprocess.mask_values import ValueSurvey
 from tests.scenes.tiny_sam3 import write_tiny_sam3
 
 WHEEL = os.environ.get("NBAVATAR_DETECTOR_MODELS")

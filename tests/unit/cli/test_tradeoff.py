@@ -135,7 +135,7 @@ def test_training_takes_order_and_window_from_a_preset(tmp_path) -> None:
 
 
 def test_a_training_keeps_textures_by_their_footprint(measured) -> None:
-    from nbavatar.avatar.model import load_avatar
+    from nbavatar.methods.storage import load_avatar
 
     scene, out = measured["scene"], str(measured["folder"] / "sized" / "model.pt")
     words = ["train", "--frames", *measured["packs"][:2], *measured["common"], "--spectral", str(scene["spectral"])]

@@ -12,11 +12,11 @@ from nbavatar.data.capture import (
     read_splits,
     read_topology,
 )
-from nbavatar.data.capture_masks import open_masks
 from nbavatar.data.capture_tracks import build_capture_tracks
 from nbavatar.data.frame_plan import plan_capture
-from nbavatar.data.sources import capture_images, capture_layers
 from nbavatar.errors import DataError
+from nbavatar.preprocess.capture_masks import open_masks
+from nbavatar.preprocess.sources import capture_images, capture_layers
 
 CHOICE = {"start": 0, "every": 1, "max_frames": 0, "test_fraction": 0.2, "test_blocks": 1}
 

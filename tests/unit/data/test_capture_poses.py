@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nbavatar.data.capture_check import check_capture
+from nbavatar.checks.capture import check_capture
 from tests.scenes.solid import write_solid
 
 FLIP = np.diag([1.0, -1.0, -1.0])

@@ -3,9 +3,9 @@ import pytest
 
 from nbavatar.camera.distortion import undistort_pixels
 from nbavatar.camera.pinhole import Camera, project
-from nbavatar.data.cropping import crop_extent, frame_boxes, plan_crop
 from nbavatar.data.sequences import MeshSequence, Part
 from nbavatar.errors import DataError
+from nbavatar.preprocess.cropping import crop_extent, frame_boxes, plan_crop
 
 CAMERA = Camera("084", 320, 180, np.array([[300.0, 0, 158.5], [0, 300.0, 92.2], [0, 0, 1]]), np.eye(4))
 FRAMES = ["000000", "000001", "000002", "000003"]

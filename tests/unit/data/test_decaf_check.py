@@ -3,9 +3,9 @@ import pytest
 
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import project
-from nbavatar.data import decaf_check
+from nbavatar.checks import decaf as decaf_check
+from nbavatar.checks.decaf import check_subject
 from nbavatar.data.decaf import find_subject
-from nbavatar.data.decaf_check import check_subject
 
 
 @pytest.mark.parametrize(("shift", "lens"), [(0.0, True), (0.5, True), (0.0, False)])

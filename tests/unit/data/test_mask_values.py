@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from nbavatar.data.mask_values import Meaning, ValueSurvey
 from nbavatar.errors import DataError
+from nbavatar.preprocess.mask_values import Meaning, ValueSurvey
 
 BOTH = ("head", "right_hand")
 

@@ -6,10 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nbavatar.camera.pinhole import Camera
-from nbavatar.data.masking import MaskNumbers, MaskStatistics, cut_masks
-from nbavatar.data.part_masks import Margins, PartCutter
 from nbavatar.data.sequences import MeshSequence, Part
 from nbavatar.mesh.zbuffer import rasterize_mesh
+from nbavatar.preprocess.masking import MaskNumbers, MaskStatistics, cut_masks
+from nbavatar.preprocess.part_masks import Margins, PartCutter
 
 WIDTH, HEIGHT = 200, 180
 MARGINS = Margins(hair=0.04, neck=0.006, hand=0.006, sleeve=0.12)

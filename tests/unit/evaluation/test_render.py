@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nbavatar.avatar.model import load_avatar
 from nbavatar.cli import main
 from nbavatar.config.evaluation import ProtocolConfig
 from nbavatar.data.sequences import MeshSequence, Part, read_sequence, write_sequence
 from nbavatar.data.views import views_of
 from nbavatar.evaluation.render import render_views
 from nbavatar.io.framepack import FramePack
+from nbavatar.methods.storage import load_avatar
 from tests.scenes.toy import FRAMES, SIZE, write_scene
 
 TRAIN = {

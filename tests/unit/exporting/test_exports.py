@@ -11,13 +11,13 @@ import torch
 import trimesh
 from torch.nn import functional
 
-from nbavatar.avatar.storage import load_avatar, save_avatar
 from nbavatar.cli import main
 from nbavatar.data.sequences import MeshSequence, read_sequence, write_sequence
-from nbavatar.splat.functional import render_gaussians
+from nbavatar.methods.storage import load_avatar, save_avatar
+from nbavatar.rendering.gaussians.functional import render_gaussians
 from tests.scenes.toy import sequence
-from tests.unit.avatar.test_model import make_avatar
-from tests.unit.baselines.test_avatars import bound, embedded
+from tests.unit.methods.billboards.test_model import make_avatar
+from tests.unit.methods.gaussians.test_avatars import bound, embedded
 
 VIEW = torch.eye(4)
 VIEW[2, 3] = 1.0

@@ -5,10 +5,10 @@ import functools
 
 import numpy as np
 
-from nbavatar.benchmarks.fit_scene import FitScene, film, make_fit_scene
 from nbavatar.data.synthetic.scene import Bodies as SyntheticBodies
 from nbavatar.data.synthetic.scene import build_bodies
 from nbavatar.fitting.stage import Bodies
+from nbavatar.studies.benchmarks.fit_scene import FitScene, film, make_fit_scene
 
 DISTORTION = np.array([-0.12, 0.08, 4e-4, -3e-4, 0.01])
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from nbavatar.benchmarks.fit_scene import WIDTH, perturb
 from nbavatar.bodymodels.files import model_arrays
 from nbavatar.bodymodels.mano import Mano, mirror_model
 from nbavatar.cli import main
@@ -19,6 +18,7 @@ from nbavatar.data.synthetic.scene import _unwrapped
 from nbavatar.errors import DataError
 from nbavatar.fitting.stage import Bodies, fit_sequence
 from nbavatar.io.arrays import write_arrays
+from nbavatar.studies.benchmarks.fit_scene import WIDTH, perturb
 
 from .scenes import make_take, vertex_error_mm
 

@@ -6,9 +6,9 @@ import torch
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from nbavatar.benchmarks.fit_scene import arc as _arc
 from nbavatar.fitting.rigid import align_points, fill_frames
 from nbavatar.fitting.triangulate import triangulate
+from nbavatar.studies.benchmarks.fit_scene import arc as _arc
 
 K0 = np.array([[3000.0, 0, 970], [0, 3010, 530], [0, 0, 1]])
 

@@ -2,7 +2,7 @@ import copy
 
 import torch
 
-from nbavatar.training.adam import Adam
+from nbavatar.optimization.adam import Adam
 
 
 def _parameters():

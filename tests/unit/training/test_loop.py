@@ -22,10 +22,10 @@ from nbavatar.data.sequences import MeshSequence, Part, read_sequence
 from nbavatar.data.views import ViewStore, views_of
 from nbavatar.errors import DataError, NBAvatarError
 from nbavatar.io.framepack import FramePack
-from nbavatar.training.billboards import parameter_groups
+from nbavatar.methods.base import create_method
+from nbavatar.methods.billboards.initial import initial_avatar
+from nbavatar.methods.billboards.training import parameter_groups
 from nbavatar.training.loop import train
-from nbavatar.training.method import create_method
-from nbavatar.training.setup import initial_avatar
 from nbavatar.training.state import RunFolder
 from tests.scenes.toy import sequence, write_scene
 from tests.unit.disks import fill

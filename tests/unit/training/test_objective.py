@@ -8,19 +8,19 @@ import pytest
 import torch
 import yaml
 
-from nbavatar.avatar.losses import loss_delta, loss_dice, loss_knn
-from nbavatar.avatar.model import compose
 from nbavatar.config.avatar import TrainConfig, UNetConfig
 from nbavatar.config.core import from_mapping
 from nbavatar.data.sequences import read_sequence
 from nbavatar.data.views import Sample, View
 from nbavatar.errors import ConfigError
-from nbavatar.raster.functional import render_billboards
-from nbavatar.training import billboards as training
-from nbavatar.training.method import create_method
-from nbavatar.training.objective import step_loss
-from nbavatar.training.schedule import Plan
-from tests.unit.avatar.test_losses import plain_dssim
+from nbavatar.methods.base import create_method
+from nbavatar.methods.billboards import training as training
+from nbavatar.methods.billboards.avatar import compose
+from nbavatar.methods.billboards.losses import loss_delta, loss_dice, loss_knn
+from nbavatar.methods.billboards.objective import step_loss
+from nbavatar.optimization.schedule import Plan
+from nbavatar.rendering.billboards.functional import render_billboards
+from tests.unit.methods.billboards.test_losses import plain_dssim
 from tests.unit.training.test_loop import run, same
 
 PAPER = yaml.safe_load((Path(__file__).parents[3] / "config/paper.yaml").read_text())["stages"]["train"]

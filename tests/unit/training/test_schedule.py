@@ -3,7 +3,7 @@
 import pytest
 
 from nbavatar.config.avatar import TrainConfig
-from nbavatar.training.schedule import plan_at, total_steps
+from nbavatar.optimization.schedule import plan_at, total_steps
 
 
 def test_paper_schedule_is_the_supplements() -> None:

@@ -10,9 +10,9 @@ from nbavatar.config.avatar import RatesConfig
 from nbavatar.errors import DataError
 from nbavatar.mesh.frames import face_frames
 from nbavatar.mesh.topology import vertex_components
-from nbavatar.training.adam import Adam
-from nbavatar.training.setup import initial_avatar
-from nbavatar.training.shape import SmoothOffsets, _components, offset_basis
+from nbavatar.methods.billboards.initial import initial_avatar
+from nbavatar.methods.billboards.offsets import SmoothOffsets, _components, offset_basis
+from nbavatar.optimization.adam import Adam
 from tests.scenes.toy import OCTAHEDRON, OCTAHEDRON_FACES, TETRAHEDRON, TETRAHEDRON_FACES, sequence
 from tests.unit.training.test_loop import CONFIG, run, same
 

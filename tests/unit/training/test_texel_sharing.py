@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nbavatar.training.billboards import BillboardTraining, shared_gradient
-from nbavatar.training.setup import initial_avatar
+from nbavatar.methods.billboards.initial import initial_avatar
+from nbavatar.methods.billboards.training import BillboardTraining, shared_gradient
 from tests.scenes.toy import sequence
 from tests.unit.training.test_loop import CONFIG
 

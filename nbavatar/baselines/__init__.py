@@ -1,1 +1,0 @@
-"""Published Gaussian avatars, trained by the same trainer on the same data: GaussianAvatars and SplattingAvatar."""

@@ -1,0 +1,1 @@
+"""What is wrong with delivered data, found before any time is spent on it."""

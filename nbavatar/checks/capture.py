@@ -1,0 +1,316 @@
+"""Everything that can be wrong with a capture, found in one go and said in one line each."""
+
+import dataclasses
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nbavatar.camera.pinhole import Camera
+from nbavatar.checks.poses import PoseJudge, sampled_frames
+from nbavatar.config.cameras import read_rig, stored_test_camera
+from nbavatar.config.preprocess import MATTE_THRESHOLD
+from nbavatar.data.capture import (
+    Capture,
+    camera_of,
+    read_mesh,
+    read_rgb,
+    read_splits,
+    read_topology,
+    recentred,
+)
+from nbavatar.data.mesh_checks import mesh_faults
+from nbavatar.data.sequences import PARTS
+from nbavatar.errors import DataError
+from nbavatar.mesh.topology import mesh_defects
+from nbavatar.preprocess.capture_masks import CameraMasks, open_masks
+from nbavatar.preprocess.supplied_masks import supplied_masks
+
+__all__ = ["CaptureReport", "Supplied", "check_capture"]
+
+_SIZES = {"head": (0.1, 0.8), "right_hand": (0.05, 0.7), "left_hand": (0.05, 0.7)}  # plausible diagonals [m]
+_MUCH_ASTRAY = 0.15  # share of a mesh's pixels off its part, of which a note is made
+
+
+class Supplied(NamedTuple):
+    """Folder of masks that are used in place of the capture's, or nothing, and whose are taken from there."""
+
+    folder: str
+    subject: str
+
+
+@dataclasses.dataclass
+class CaptureReport:
+    """What a check found.
+
+    Attributes:
+        defects: lines that name what has to be mended before the capture can be used.
+        notes: lines about what is unusual but usable.
+        supplied: masks that are used in place of the capture's.
+        overlap: camera -> intersection over union of its masks and the projected meshes, in a few frames.
+        astray: camera -> share of the projected meshes' pixels that are off their part of the masks, in these frames.
+        capture: the capture, if its cameras can be read.
+        frames: frame ids.
+        topology: faces and rest vertices of the parts.
+        masks: camera -> its masks, if they can be read.
+    """
+
+    defects: list[str] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+    supplied: Supplied = Supplied("", "")
+    overlap: dict[str, float] = dataclasses.field(default_factory=dict)
+    astray: dict[str, float] = dataclasses.field(default_factory=dict)
+    capture: Capture | None = None
+    frames: list[str] = dataclasses.field(default_factory=list)
+    topology: dict[str, tuple[np.ndarray, np.ndarray | None]] = dataclasses.field(default_factory=dict)
+    masks: dict[str, CameraMasks] = dataclasses.field(default_factory=dict)
+
+
+class _Collector:
+    """Collects defects; many of one kind become one line with a count."""
+
+    def __init__(self, lines: list[str]) -> None:
+        self._lines, self._groups = lines, {}
+
+    def attempt(self, group: str, call: Callable[[], Any]) -> Any:
+        """The call's result, or None after noting its error."""
+        try:
+            return call()
+        except DataError as error:
+            self.note(group, str(error))
+            return None
+
+    def note(self, group: str, line: str) -> None:
+        self._groups.setdefault(group, []).append(line)
+
+    def close(self) -> None:
+        for lines in self._groups.values():
+            more = f" (and {len(lines) - 1} more like it)" if len(lines) > 1 else ""
+            self._lines.append(lines[0] + more)
+
+
+def check_capture(
+    root: str | Path,
+    progress: Callable[[Iterable[str], str], Iterable[str]] = lambda items, _: items,
+    *,
+    pixel_center: float = 0.5,
+    supplied: str = "",
+    subject: str = "",
+) -> CaptureReport:
+    """Reads every file of a capture and compares them with each other.
+
+    Args:
+        root: folder of the capture.
+        progress: wraps the loop over the frames of a camera, for a progress bar.
+        pixel_center: where the stored matrices put the centre of pixel (0, 0) [px].
+        supplied: folder of masks that are used in place of the capture's, see `supplied_masks`; empty for none.
+        subject: whose masks are taken from there.
+
+    Returns:
+        the report; the capture is usable if `defects` is empty.
+    """
+    root = Path(root)
+    report = CaptureReport(supplied=Supplied(supplied, subject))
+    found = _Collector(report.defects)
+    if not root.is_dir():
+        report.defects.append(f"{root}: expected the folder of a capture, found no such folder")
+        return report
+    cameras = found.attempt("cameras", lambda: _cameras(root, found, pixel_center)) or {}
+    splits = found.attempt("splits", lambda: read_splits(root))
+    report.topology = found.attempt("topology", lambda: read_topology(root)) or {}
+    capture = recentred(root, cameras)
+    cameras = capture.cameras
+    if cameras:
+        report.capture = capture
+        if capture.origin.any():
+            moved = ", ".join(f"{x:.0f}" for x in capture.origin)
+            report.notes.append(f"{root / 'cameras.json'}: the world's origin is far away; it is moved to ({moved}) m")
+    if splits is not None:
+        report.frames = splits.frames
+        if cameras:
+            found.attempt("test camera", lambda: stored_test_camera(root, read_rig(root / "cameras.json")))
+        _note_on_order(root, splits.frames, report)
+    meshes = _check_meshes(capture, report, found) if report.topology and report.frames else {}
+    judge = PoseJudge(cameras, report.topology, meshes)
+    for camera in cameras.values():
+        _check_camera(capture, camera, report, found, judge, progress)
+    if meshes:
+        _check_poses(root, judge, report, found)
+    if len(cameras) == 1:
+        report.notes.append(f"{root / 'cameras.json'}: one camera only; held-out poses are judged, new views are not")
+    _notes_on_topology(root, report)
+    found.close()
+    return report
+
+
+def _cameras(root: Path, found: _Collector, pixel_center: float) -> dict[str, Camera]:
+    path = root / "cameras.json"
+    cameras = {}
+    for name, entry in read_rig(path).items():
+        camera = found.attempt(f"camera {name}", lambda: camera_of(name, entry, path, pixel_center))  # noqa: B023
+        if camera is not None:
+            cameras[name] = camera
+    return cameras
+
+
+def _check_meshes(capture: Capture, report: CaptureReport, found: _Collector) -> dict[str, dict[str, np.ndarray]]:
+    root = capture.root
+    meshes: dict[str, dict[str, np.ndarray]] = {}
+    first: dict[str, np.ndarray] = {}
+    for frame in report.frames:
+        mesh = found.attempt("meshes", lambda: read_mesh(capture, frame, report.topology))  # noqa: B023
+        if mesh is None:
+            continue
+        path = root / "meshes" / f"{frame}.npz"
+        if {n: v.shape for n, v in mesh.items() if n in first} != {n: v.shape for n, v in first.items() if n in mesh}:
+            found.note("counts", f"{path}: expected as many vertices as in the frames before, found another number")
+            continue
+        if "head" in mesh and "head" in first and ("head_rigid" in mesh) != ("head_rigid" in first):
+            found.note("rigid", f"{path}: head_rigid: expected it in all frames or in none, found it only in some")
+        for part, (low, high) in _SIZES.items():
+            if part in mesh:
+                size = float(np.linalg.norm(np.ptp(mesh[part], axis=0)))
+                if not low <= size <= high:
+                    expected = f"a size of {low} to {high} m"
+                    error = DataError.of(
+                        path, part, expected=expected, found=f"{size:.3g}", fix="lengths must be metres"
+                    )
+                    found.note(f"size {part}", str(error))
+        meshes[frame] = mesh
+        first = mesh | first
+    if meshes:
+        for part, (faces, rest) in report.topology.items():
+            mesh = next((mesh for mesh in meshes.values() if part in mesh), None)
+            if mesh is None:
+                where, fix = root / "meshes", f"leave {part}_faces out of topology.npz if it is nowhere"
+                found.note(f"absent {part}", str(DataError.of(where, part, expected="vertices", found="none", fix=fix)))
+                continue
+            for state in (part, f"{part}_rigid"):
+                of_part = {frame: mesh[state] for frame, mesh in meshes.items() if state in mesh}
+                for line in mesh_faults(root / "meshes", state, faces, rest, of_part) if of_part else ():
+                    found.note(f"surface {part}", line)
+    return meshes
+
+
+def _check_camera(
+    capture: Capture,
+    camera: Camera,
+    report: CaptureReport,
+    found: _Collector,
+    judge: PoseJudge,
+    progress: Callable[[Iterable[str], str], Iterable[str]],
+) -> None:
+    name = camera.name
+    masks = found.attempt(f"masks {name}", lambda: open_masks(capture, camera, report.frames))
+    if masks is not None:
+        report.masks[name] = masks
+        for kind, meaning in (("masks", masks.mask), ("alpha", masks.coverage)):
+            if meaning is not None and meaning.white not in (0, 255, 65535):
+                where = capture.root / kind / name
+                report.notes.append(f"{where}: a matte in which {meaning.white} is full coverage")
+    for frame in progress(report.frames, f"check {name}"):
+        found.attempt(f"images {name}", lambda: read_rgb(capture, camera, frame))  # noqa: B023
+    if report.supplied.folder:
+        folder, parts = Path(report.supplied.folder), tuple(report.topology)
+        own = found.attempt(
+            f"supplied {name}", lambda: supplied_masks(folder, report.supplied.subject, camera, report.frames, parts)
+        )
+        if own is not None:
+            shown = zip(report.frames, own[0])
+            _check_masks(folder / name, camera, shown, own[1].kind == "label", report, found, judge)
+    elif masks is not None and (masks.mask is not None or masks.coverage is not None):
+        labelled, there = masks.mask is not None and masks.mask.kind == "label", masks.mask is not None
+        shown = ((frame, masks.read_mask(frame) if there else masks.read_coverage(frame)) for frame in report.frames)
+        _check_masks(capture.root / "masks" / name, camera, shown, labelled, report, found, judge)
+    elif masks is not None and report.frames:
+        where = capture.root / "masks" / name
+        line = DataError.of(where, expected="a mask (or an alpha image) for each frame", found="none")
+        found.note(f"no mask {name}", str(line))
+
+
+def _check_masks(
+    folder: Path,
+    camera: Camera,
+    masks: Iterable[tuple[str, np.ndarray | None]],
+    labelled: bool,
+    report: CaptureReport,
+    found: _Collector,
+    judge: PoseJudge,
+) -> None:
+    """Looks at (frame, mask) of one camera: labels 0..3, or mattes of the person."""
+    sampled, empty, labels, count = set(sampled_frames(report.frames)), [], set(), 0
+    for frame, mask in masks:
+        assert mask is not None
+        person = mask if labelled else (mask > MATTE_THRESHOLD).astype(np.uint8)
+        count += 1
+        if not person.any():
+            empty.append(frame)
+        if labelled:
+            labels |= set(np.unique(mask).tolist())
+        if frame in sampled:
+            judge.add(camera.name, frame, person, labelled=labelled)
+    if count and len(empty) == count:
+        line = DataError.of(
+            folder, expected="labelled pixels in a frame at least", found=f"none in {count}",
+            fix="mend the masks, or leave this camera out of cameras.json",
+        )  # fmt: skip
+        found.note(f"nothing {camera.name}", str(line))
+    elif empty:
+        more = f" (and {len(empty) - 1} more frames)" if len(empty) > 1 else ""
+        report.notes.append(f"{folder / empty[0]}: the mask is empty{more}")
+    for value in sorted(labels - {0}):
+        part = PARTS[value - 1]
+        if report.topology and part not in report.topology:
+            where = report.capture.root / "meshes" / "topology.npz" if report.capture else folder
+            line = DataError.of(where, f"{part}_faces", expected=f"a mesh for label {value} of the masks", found="none")
+            found.note(f"label {value}", str(line))
+
+
+def _check_poses(root: Path, judge: PoseJudge, report: CaptureReport, found: _Collector) -> None:
+    path = root / "cameras.json"
+    lines = judge.defects(path)
+    report.overlap, report.astray = judge.overlaps(), judge.misfits()
+    for line in lines:
+        found.note("poses", line)
+    for name, astray in report.astray.items() if not lines else ():
+        if astray > _MUCH_ASTRAY:
+            report.notes.append(
+                f"{path}: camera {name}: {astray:.0%} of the meshes' pixels are off their part of the masks"
+            )
+
+
+def _note_on_order(root: Path, frames: list[str], report: CaptureReport) -> None:
+    """Frames are a film in the order of splits.json; another order than that of their names is seldom meant."""
+
+    def natural(frame: str) -> list[tuple[int, str]]:
+        return [(int(piece), "") if piece.isdecimal() else (-1, piece) for piece in re.split(r"(\d+)", frame)]
+
+    for before, after in zip(frames, frames[1:]):
+        if natural(before) > natural(after):
+            path = root / "splits.json"
+            report.notes.append(
+                f"{path}: frames: {before} comes before {after}; is that the order in time? (a sorting as text puts 10 "
+                "before 9)"
+            )
+            return
+
+
+def _notes_on_topology(root: Path, report: CaptureReport) -> None:
+    for part, (faces, rest) in report.topology.items():
+        verts = rest if rest is not None else None
+        if verts is None:
+            continue
+        defects = mesh_defects(verts.astype(np.float64), faces)
+        unusual = {
+            "faces with a vertex twice": len(defects.repeated_vertex),
+            "duplicate faces": len(defects.duplicate),
+            "faces without area": len(defects.zero_area),
+            "edges of three faces or more": len(defects.non_manifold),
+            "edges between faces of opposite winding": len(defects.inconsistent),
+            "vertices without a face": len(defects.unreferenced),
+        }
+        said = ", ".join(f"{count} {what}" for what, count in unusual.items() if count)
+        if said:
+            report.notes.append(f"{root / 'meshes' / 'topology.npz'}: {part}: {said}")

@@ -1,1 +1,0 @@
-"""Masks, crops, resizing and compositing of images."""

@@ -1,0 +1,1 @@
+"""The paper's method: neural billboards and their U-Net."""

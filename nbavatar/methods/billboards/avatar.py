@@ -1,0 +1,350 @@
+"""The avatar as one object: meshes' faces, billboards and renderer.
+
+    features, nb_alpha = rasterize(billboards posed on the mesh)          paper, eq. 1
+    colour, alpha      = R(features, nb_alpha)                            U-Net
+    I                  = colour alpha + (1 - alpha) background            paper, eq. 2
+
+Without deferred rendering (ablation 'w/o DNR') the textures hold RGB behind a sigmoid and the billboards' own
+opacity is the picture's.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from nbavatar.math.rotations import matrix_to_quaternion
+from nbavatar.mesh.frames import FaceFrames, face_frames
+from nbavatar.methods.base import MeshAvatar, Stages, compose
+from nbavatar.methods.billboards.billboards import Billboards, Posed
+from nbavatar.methods.billboards.compression.sized import SizedBillboards
+from nbavatar.methods.billboards.refine import Refinement
+from nbavatar.methods.billboards.region import Region, full_region, paste, region_of, shift_camera
+from nbavatar.methods.billboards.unet import UNet, macs
+from nbavatar.rendering.billboards.functional import render_billboards
+
+__all__ = ["Anchor", "Architecture", "Avatar", "Window"]
+
+_DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+@dataclasses.dataclass(frozen=True)
+class Architecture:
+    """Numbers that fix an avatar's tensors and how it is rendered; see `nbavatar.config.avatar.TrainConfig`."""
+
+    channels: int
+    texels: int
+    deferred: bool
+    unet_width: int
+    unet_depth: int
+    unet_max_width: int
+    unet_convs: int
+    roi: bool
+    roi_margin: float
+    order: str
+
+
+class Anchor(NamedTuple):
+    """Where the billboards of one frame ride; independent of them, so it may be kept while they are trained.
+
+    Attributes:
+        frames: face frames of the parts that are there.
+        quats: rotations of the frames, wxyz (F, 4).
+        keep: indices of the faces whose part is there in this frame, or None for all.
+        penalty: of the refinement, scalar [m^2].
+    """
+
+    frames: FaceFrames
+    quats: Tensor
+    keep: Tensor | None
+    penalty: Tensor
+
+
+class Window(NamedTuple):
+    """One rendered window of the image plane.
+
+    Attributes:
+        colour: I_R (without deferred rendering: colour divided by opacity), (3, h, w).
+        alpha: I_alpha, (h, w).
+        nb_alpha: opacity of the rasterized billboards I_alpha^NB, (h, w).
+        features: premultiplied features I_f^NB, (C, h, w).
+        region: where the window lies.
+    """
+
+    colour: Tensor
+    alpha: Tensor
+    nb_alpha: Tensor
+    features: Tensor
+    region: Region
+
+
+class Avatar(MeshAvatar):
+    """Neural billboards on the faces of the parts, and the renderer.
+
+    Attributes:
+        billboards: one per face (`SizedBillboards` where textures have sizes of their own).
+        unet: renderer R, or None without deferred rendering.
+        refinement: compensation of fitting errors on training frames, or None.
+    """
+
+    method: ClassVar[str] = "billboards"
+
+    def __init__(
+        self,
+        architecture: Architecture,
+        faces: Mapping[str, Tensor],
+        vertex_counts: Mapping[str, int],
+        billboards: Billboards,
+        *,
+        refinement: Refinement | None = None,
+        record: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__(faces, vertex_counts, record)
+        self.architecture = architecture
+        self.billboards = billboards
+        a = architecture
+        self.unet = (
+            UNet(
+                a.channels + 1, width=a.unet_width, depth=a.unet_depth, max_width=a.unet_max_width, convs=a.unet_convs
+            ).to(memory_format=torch.channels_last)
+            if a.deferred
+            else None
+        )
+        self.refinement = refinement
+
+    @property
+    def primitives(self) -> int:
+        """Number of billboards."""
+        return len(self.billboards.mu)
+
+    @property
+    def fixed_anchors(self) -> bool:
+        """Anchors stay as they are unless a refinement moves the meshes."""
+        return self.refinement is None
+
+    @property
+    def multiple(self) -> int:
+        """Alignment of rendered windows [px]."""
+        return 2**self.architecture.unet_depth if self.unet is not None else 1
+
+    def anchor(self, verts: Mapping[str, Tensor], frame: str | None = None) -> Anchor:
+        """Face frames of one frame's meshes.
+
+        Args:
+            verts: vertices per part, float (V, 3) [m]; a part that is missing or not finite in this frame is left out.
+            frame: id of a training frame, to use its refinement; None: as they are.
+
+        Raises:
+            DataError: a part has another number of vertices.
+        """
+        penalty = self.billboards.mu.new_zeros(())
+
+        def refined(part: str, points: Tensor) -> Tensor:
+            nonlocal penalty
+            if self.refinement is None or frame is None:
+                return points
+            points, extra = self.refinement(part, points, frame)
+            penalty = penalty + extra
+            return points
+
+        points, keep = self.merged(verts, refined)
+        frames = face_frames(points, self.faces if keep is None else self.faces[keep])
+        return Anchor(frames, matrix_to_quaternion(frames.R), keep, penalty)
+
+    def place(self, anchor: Anchor) -> tuple[Posed, Tensor | None]:
+        """Billboards in world space, and the indices of those that are there (None: all)."""
+        return self.billboards.pose(anchor.frames, anchor.quats, anchor.keep), anchor.keep
+
+    def pose(self, verts: Mapping[str, Tensor], frame: str | None = None) -> tuple[Posed, Tensor | None]:
+        """Pose the billboards on one frame's meshes: `anchor` and `place`."""
+        return self.place(self.anchor(verts, frame))
+
+    def window(
+        self,
+        posed: Posed,
+        keep: Tensor | None,
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        *,
+        precision: str = "fp32",
+        roi: bool | None = None,
+        order: str | None = None,
+    ) -> Window:
+        """Rasterize and decode one view.
+
+        Args:
+            posed, keep: from `place` or `pose`.
+            viewmat: world to camera (4, 4); K: intrinsics (3, 3) [px]; width, height: image size [px].
+            precision: fp32, bf16 or fp16 for the U-Net.
+            roi, order: override the avatar's own settings.
+        """
+        a = self.architecture
+        features, alpha = self.textures()
+        if keep is not None:
+            features, alpha = features[keep], alpha[keep]
+        region = full_region(width, height, self.multiple)
+        if a.roi if roi is None else roi:
+            region = region_of(posed, viewmat, K, width, height, multiple=self.multiple, margin=a.roi_margin)
+        premultiplied, nb_alpha = render_billboards(
+            posed.means,
+            posed.quats,
+            posed.half_extents,
+            features,
+            alpha,
+            viewmat,
+            shift_camera(K, region),
+            region.width,
+            region.height,
+            order=order or a.order,
+        )
+        colour, opacity = self.decode(premultiplied, nb_alpha, precision)
+        return Window(colour, opacity, nb_alpha, premultiplied, region)
+
+    def textures(self) -> tuple[Tensor, Tensor]:
+        """Activated textures: features (F, T, T, C) and opacity (F, T, T)."""
+        features = self.billboards.features
+        return (features if self.unet is not None else torch.sigmoid(features)), self.billboards.alpha()
+
+    def decode(self, features: Tensor, nb_alpha: Tensor, precision: str = "fp32") -> tuple[Tensor, Tensor]:
+        """Colour I_R (3, h, w) and opacity I_alpha (h, w) from rasterized features (C, h, w) and alpha (h, w)."""
+        if self.unet is None:
+            return features / nb_alpha.clamp_min(1e-6), nb_alpha
+        stacked = torch.cat((features, nb_alpha[None]))[None].contiguous(memory_format=torch.channels_last)
+        if precision == "fp32":
+            colour, opacity = self.unet(stacked)
+        else:
+            with torch.autocast(stacked.device.type, dtype=_DTYPES[precision]):
+                colour, opacity = self.unet(stacked)
+        return colour[0], opacity[0, 0]
+
+    def render(
+        self,
+        verts: Mapping[str, Tensor],
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        background: Tensor,
+        *,
+        frame: str | None = None,
+        **options: Any,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Whole picture: image (3, H, W), alpha (H, W) and the billboards' alpha (H, W); options as in `window`."""
+        posed, keep = self.pose(verts, frame)
+        window = self.window(posed, keep, viewmat, K, width, height, **options)
+        alpha = paste(window.alpha, window.region, width, height)
+        nb_alpha = paste(window.nb_alpha, window.region, width, height)
+        colour = paste(window.colour, window.region, width, height)
+        return compose(colour, alpha, background), alpha, nb_alpha
+
+    def panels(
+        self,
+        verts: Mapping[str, Tensor],
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        background: Tensor,
+        frame: str | None = None,
+    ) -> list[Tensor]:
+        """Render, opacity of the billboards, and their first three features in false colours."""
+        posed, keep = self.pose(verts, frame)
+        window = self.window(posed, keep, viewmat, K, width, height)
+        place = window.region, width, height
+        image = compose(paste(window.colour, *place), paste(window.alpha, *place), background)
+        nb_alpha = paste(window.nb_alpha, *place).expand(3, -1, -1)
+        # Shifted so that zero is grey; fewer channels are repeated.
+        shown = window.features[[min(i, len(window.features) - 1) for i in range(3)]]
+        return [image, nb_alpha, paste(0.5 + 0.5 * torch.tanh(shown), *place, 0.5)]
+
+    def stages(
+        self,
+        verts: Mapping[str, Tensor],
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        background: Tensor,
+        precisions: Sequence[str],
+    ) -> Stages:
+        """Stages of the paper's timing table: pose, raster (neural textures, RGB), renderer, compose, total."""
+        with torch.no_grad():
+            posed, keep = self.pose(verts)
+            features, alpha = self.textures()
+            if keep is not None:
+                features, alpha = features[keep], alpha[keep]
+            window = self.window(posed, keep, viewmat, K, width, height)
+            rgb = features[..., [min(i, features.shape[-1] - 1) for i in range(3)]].contiguous()
+        region = window.region
+
+        def raster(values: Tensor) -> Callable[[], Any]:
+            return lambda: render_billboards(
+                *posed, values, alpha, viewmat, shift_camera(K, region), region.width, region.height,
+                order=self.architecture.order,
+            )  # fmt: skip
+
+        calls: dict[str, Callable[[], Any]] = {
+            "pose": lambda: self.pose(verts),
+            "raster": raster(features),
+            "raster_rgb": raster(rgb),
+            "compose": lambda: compose(window.colour, window.alpha, background),
+        }
+        for precision in precisions if self.unet is not None else ["fp32"]:
+            if self.unet is not None:
+                calls[f"renderer_{precision}"] = lambda p=precision: self.decode(window.features, window.nb_alpha, p)
+            calls[f"total_{precision}"] = lambda p=precision: self.render(
+                verts, viewmat, K, width, height, background, precision=p
+            )[0]
+        return Stages(calls, region.width * region.height / (width * height))
+
+    def facts(self, width: int, height: int) -> dict[str, Any]:
+        """Billboards, channels, texels, and multiply-adds of the renderer for a whole picture."""
+        return {
+            "billboards": self.primitives,
+            "channels": self.architecture.channels,
+            "texels": self.architecture.texels,
+            "renderer_gmac": None if self.unet is None else round(macs(self.unet, height, width) / 1e9, 3),
+        }
+
+    def content(self) -> dict[str, Any]:
+        """Architecture and refinement."""
+        refinement = self.refinement
+        return {
+            "architecture": dataclasses.asdict(self.architecture),
+            "refinement": None if refinement is None else {"frames": refinement.frames, "rigid": refinement.rigid},
+        }
+
+    @classmethod
+    def rebuild(cls, content: Mapping[str, Any], state: Mapping[str, Tensor], record: Mapping[str, Any]) -> "Avatar":
+        """An avatar of the stored shape, its values still to be loaded."""
+        architecture = Architecture(**content["architecture"])
+        if "billboards.sizes" in state:
+            billboards = SizedBillboards.of_state(architecture.texels, state, "billboards.")
+        else:
+            billboards = Billboards(
+                torch.ones_like(state["billboards.log_scale"]),
+                state["billboards.features"],
+                state["billboards.alpha_logit"],
+            )
+        return cls(
+            architecture,
+            content["faces"],
+            content["vertex_counts"],
+            billboards,
+            refinement=_empty_refinement(content["refinement"], state),
+            record=record,
+        )
+
+
+def _empty_refinement(described: Mapping[str, Any] | None, state: Mapping[str, Tensor]) -> Refinement | None:
+    """Refinement of the stored shape, its values still to be loaded."""
+    if described is None:
+        return None
+    prefix = "refinement.basis_"
+    basis = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
+    frames: Sequence[str] = described["frames"]
+    return Refinement(frames, basis, rigid=bool(described["rigid"]))

@@ -1,0 +1,1 @@
+"""Smaller models of trained billboards: fewer of them, smaller textures."""

@@ -1,0 +1,139 @@
+"""Training of the paper's avatar as a `Method`: rates of the supplement, the loss of section 3.4."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nbavatar.config.avatar import TrainConfig
+from nbavatar.data.sequences import MeshSequence
+from nbavatar.data.views import Sample, View
+from nbavatar.errors import ConfigError
+from nbavatar.methods.base import Method, StepLoss
+from nbavatar.methods.billboards.avatar import Anchor, Avatar
+from nbavatar.methods.billboards.compression.footprint import largest_footprints, texels_of
+from nbavatar.methods.billboards.compression.prune import prune
+from nbavatar.methods.billboards.compression.reduce import size_textures
+from nbavatar.methods.billboards.initial import initial_avatar, neighbour_graph
+from nbavatar.methods.billboards.objective import step_loss
+from nbavatar.methods.billboards.offsets import SmoothOffsets
+from nbavatar.optimization.adam import Adam
+from nbavatar.optimization.schedule import Plan
+
+__all__ = ["BillboardTraining", "parameter_groups", "shared_gradient"]
+
+_SAMPLED_VIEWS = 200  # a billboard shows for many frames, so a sample of the views finds it
+
+
+class BillboardTraining(Method):
+    """Neural billboards and their U-Net.
+
+    Attributes:
+        neighbours: of every billboard, int64 (F, K), or None when the term is off.
+        offsets: smooth fields that move the billboards too, or None.
+    """
+
+    avatar: Avatar
+
+    def __init__(
+        self, avatar: Avatar, neighbours: Tensor | None, config: TrainConfig, offsets: SmoothOffsets | None = None
+    ) -> None:
+        super().__init__(avatar, config)
+        self.neighbours, self.offsets = neighbours, offsets
+        if config.texel_sharing > 0:
+            for textures in (avatar.billboards.features, avatar.billboards.alpha_logit):
+                textures.register_hook(lambda gradient: shared_gradient(gradient, config.texel_sharing))
+
+    @classmethod
+    def create(
+        cls,
+        sequence: MeshSequence,
+        coords: Mapping[str, np.ndarray],
+        views: Sequence[View],
+        config: TrainConfig,
+        device: str,
+    ) -> "BillboardTraining":
+        """See `Method.create`."""
+        if max(config.weight_mse, config.weight_l1, config.weight_dssim) == 0:
+            weights = "--cfg.weight_mse, weight_l1, weight_dssim"
+            raise ConfigError.of(weights, expected="one above 0, or no colour is learnt", found="three zeros")
+        frames = [sequence.frames[row] for row in sorted({view.row for view in views})]
+        avatar = initial_avatar(sequence, coords, frames, config).to(device)
+        neighbours = neighbour_graph(avatar, sequence, config)
+        offsets = SmoothOffsets(avatar, sequence, coords) if config.rates.offset > 0 else None
+        return cls(avatar, None if neighbours is None else neighbours.to(device), config, offsets)
+
+    def lpips_net(self) -> str | None:
+        """See `Method.lpips_net`."""
+        return self.config.lpips_net if self.config.weight_lpips > 0 else None
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """See `Method.parameter_groups`."""
+        groups = parameter_groups(self.avatar, self.config)
+        if self.offsets is not None:
+            rates = self.config.rates
+            field = {"name": "offset", "params": [self.offsets.coefficients], "final": rates.position_final}
+            groups.append({**field, "lr": rates.offset * self.config.rate_factor})
+        return groups
+
+    def step_loss(
+        self,
+        sample: Sample,
+        anchor: Anchor,
+        lpips: Callable[[Tensor, Tensor], Tensor] | None,
+        plan: Plan,
+        random: torch.Generator,
+    ) -> StepLoss:
+        """See `Method.step_loss`."""
+        return StepLoss(*step_loss(self.avatar, sample, anchor, self.neighbours, lpips, plan, self.config, random))
+
+    def after_step(self, optimizer: Adam, aux: Any, step: int, progress: float, random: torch.Generator) -> None:
+        """See `Method.after_step`."""
+        if self.offsets is not None:
+            self.offsets.apply()
+        if self.avatar.refinement is not None:
+            self.avatar.refinement.centre()
+
+    def finish(self, meshes: Mapping[str, Tensor], views: Sequence[View]) -> Avatar:
+        """Fewer billboards and smaller textures, where the options say so."""
+        avatar, config = self.avatar, self.config
+        if config.prune_margin is not None:
+            avatar = prune(avatar, meshes, views, margin=config.prune_margin, most_views=_SAMPLED_VIEWS)
+        if config.texture_density is not None:
+            footprints = largest_footprints(avatar, meshes, views, most_views=_SAMPLED_VIEWS)
+            avatar = size_textures(avatar, texels_of(footprints, config.texture_density))
+        return avatar
+
+
+def shared_gradient(gradient: Tensor, share: float) -> Tensor:
+    """Gradient of textures (F, T, T, ...) with the mean over each billboard's texels added `share` times.
+
+    Not part of the paper. A view touches few texels of a billboard, so each of them alone learns from few views; what
+    they have in common, the colour of the place, is learnt from all. The direction is still one of descent: the
+    gradient is multiplied by a positive definite matrix.
+    """
+    return gradient + share * gradient.mean((1, 2), keepdim=True)
+
+
+def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]]:
+    """Adam groups with the rates of the supplement (`Method.parameter_groups`)."""
+    billboards, rates = avatar.billboards, config.rates
+    groups: list[dict[str, Any]] = [
+        {"name": "position", "lr": rates.position, "params": [billboards.mu], "final": rates.position_final},
+        {"name": "rotation", "lr": rates.rotation, "params": [billboards.quat]},
+        {"name": "scale", "lr": rates.scale, "params": [billboards.log_scale]},
+        {
+            "name": "features",
+            "lr": rates.features if config.deferred else rates.colour,
+            "params": [billboards.features],
+        },
+        {"name": "alpha", "lr": rates.alpha, "params": [billboards.alpha_logit]},
+    ]
+    if avatar.unet is not None:
+        network = list(avatar.unet.parameters())
+        groups.append({"name": "renderer", "lr": rates.renderer, "params": network, "clip": config.clip})
+    if avatar.refinement is not None:
+        groups.append({"name": "refine", "lr": config.refine.rate, "params": list(avatar.refinement.parameters())})
+    return [{**group, "lr": group["lr"] * config.rate_factor} for group in groups]

@@ -1,0 +1,1 @@
+"""GaussianAvatars (Qian et al. 2024): Gaussians bound to triangles."""

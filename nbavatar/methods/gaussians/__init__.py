@@ -1,0 +1,1 @@
+"""What methods of 3D Gaussians on meshes share."""

@@ -1,0 +1,1 @@
+"""One step of training: Adam, and the settings of a step over time."""

@@ -1,0 +1,1 @@
+"""Masks and crops: from delivered pictures to the square windows that training reads."""

@@ -1,5 +1,0 @@
-"""Differentiable rasterizer of textured billboards."""
-
-from nbavatar.raster.functional import render_billboards
-
-__all__ = ["render_billboards"]

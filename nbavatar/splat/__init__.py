@@ -1,5 +1,0 @@
-"""Differentiable rasterizer of 3D Gaussians."""
-
-from nbavatar.splat.functional import SplatImage, render_gaussians
-
-__all__ = ["SplatImage", "render_gaussians"]

@@ -1,0 +1,1 @@
+"""What measures the project itself: benchmarks, speed against accuracy, numerical extremes."""

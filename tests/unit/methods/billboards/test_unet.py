@@ -1,0 +1,93 @@
+"""The renderer: sizes, ranges, structure of the supplement, guards."""
+
+import pytest
+import torch
+from torch import nn
+
+from nbavatar.methods.billboards.unet import UNet, macs
+
+
+@pytest.mark.parametrize(("height", "width"), [(32, 32), (64, 32), (96, 160)])
+def test_unet_keeps_the_size_and_stays_in_the_unit_range(height: int, width: int) -> None:
+    colour, opacity = UNet(7, width=4, max_width=16)(10.0 * torch.randn(2, 7, height, width))
+    assert colour.shape == (2, 3, height, width)
+    assert opacity.shape == (2, 1, height, width)
+    for value in (colour, opacity):
+        assert 0.0 <= value.min() and value.max() <= 1.0
+        assert torch.isfinite(value).all()
+
+
+def test_unet_refuses_sizes_that_do_not_divide() -> None:
+    with pytest.raises(ValueError, match="multiples of 32, found 40x64"):
+        UNet(7, width=4)(torch.zeros(1, 7, 40, 64))
+
+
+def test_unet_has_the_layers_of_the_supplement() -> None:
+    network = UNet(7, width=4, depth=5)
+    strided = [m for m in network.modules() if isinstance(m, nn.Conv2d) and m.stride == (2, 2)]
+    assert len(strided) == 5
+    assert not any(isinstance(m, nn.ConvTranspose2d) for m in network.modules())
+    assert any(isinstance(m, nn.InstanceNorm2d) for m in network.modules())
+    upsample = next(m for m in network.modules() if isinstance(m, nn.Upsample))
+    assert upsample.mode == "bilinear"
+
+
+def test_unet_single_pixel_bottleneck_trains() -> None:
+    network = UNet(3, width=2, depth=5).train()
+    colour, opacity = network(torch.randn(1, 3, 32, 32))
+    (colour.sum() + opacity.sum()).backward()
+    assert all(torch.isfinite(p.grad).all() for p in network.parameters() if p.grad is not None)
+
+
+def test_unet_every_parameter_gets_a_gradient() -> None:
+    network = UNet(3, width=2, depth=2)
+    colour, opacity = network(torch.randn(1, 3, 16, 16))
+    (colour.square().sum() + opacity.square().sum()).backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
+
+
+def test_unet_is_the_same_in_both_memory_formats() -> None:
+    network = UNet(4, width=8, depth=3).eval()
+    image = torch.randn(1, 4, 64, 64)
+    plain = network(image)
+    last = network.to(memory_format=torch.channels_last)(image.contiguous(memory_format=torch.channels_last))
+    for a, b in zip(plain, last, strict=True):
+        torch.testing.assert_close(a, b, atol=2e-5, rtol=0)
+
+
+def test_unet_normalises_a_picture_alike_in_training_and_rendering() -> None:
+    torch.manual_seed(0)
+    network = UNet(4, width=8, depth=3).to(memory_format=torch.channels_last).double()
+    image = torch.randn(1, 4, 64, 64, dtype=torch.float64)
+
+    def values_and_gradients() -> list[torch.Tensor]:
+        network.zero_grad()
+        colour, opacity = network(image)
+        (colour.square().sum() + opacity.sum()).backward()
+        return [colour.detach(), opacity.detach(), *(p.grad.clone() for p in network.parameters())]
+
+    network.train()
+    training = values_and_gradients()
+    network.eval()
+    for a, b in zip(training, values_and_gradients(), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-9, rtol=1e-9)  # in float64 nothing but the order of sums is left
+
+
+def test_unet_half_precision_stays_near() -> None:
+    network = UNet(4, width=8, depth=3).eval()
+    image = torch.randn(1, 4, 32, 32)
+    with torch.no_grad():
+        exact, _ = network(image)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            near, _ = network(image)
+    # bfloat16 keeps 8 bits; ten layers of it stay within a few grey levels of the unit range.
+    assert (exact - near).abs().mean() < 0.01
+
+
+def test_macs_of_one_level_equal_hand_count() -> None:
+    network = UNet(3, width=2, depth=1, convs=1)
+    # stem 3>2, down 2>4 at half size, lift 4>2, merge 4>2, heads 2>3 and 2>1: 9 multiplications each
+    full, half = 8 * 8, 4 * 4
+    expected = 9 * (full * (3 * 2 + 4 * 2 + 4 * 2 + 2 * 3 + 2 * 1) + half * 2 * 4)
+    assert macs(network, 8, 8) == expected
+    assert macs(network, 16, 8) == 2 * expected

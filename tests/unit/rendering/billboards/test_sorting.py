@@ -1,0 +1,61 @@
+"""Sorting networks, and what the kernels that use them may rely on."""
+
+import numba
+import numpy as np
+import pytest
+
+from nbavatar.jit.lanes import LANES, bits, load, spread
+from nbavatar.jit.memory import pointer
+from nbavatar.rendering.sorting import LONGEST, comparisons, network
+
+_NONE = np.float32(-np.inf)
+_sort = network(LONGEST)
+
+
+@numba.njit
+def _sort_queues(keys, opacities, ids, held, plane, none):
+    """Sorts the queues of the first eight pixels; returns the mask of those with a tie."""
+    held = load(pointer(held, 0), 0)
+    return bits(_sort(pointer(keys, 0), pointer(opacities, 0), pointer(ids, 0), 0, plane, held, spread(none)))
+
+
+@pytest.mark.parametrize("count", range(LONGEST + 1))
+def test_comparisons_sort_whatever_they_are_given(count):
+    # 0-1 principle (Knuth 5.3.4, theorem Z): what sorts all zeros and ones sorts everything.
+    numbers = np.arange(2**count)[:, None] >> np.arange(count) & 1
+    for i, j in comparisons(count):
+        assert i < j
+        numbers[:, i], numbers[:, j] = numbers[:, [i, j]].min(1), numbers[:, [i, j]].max(1)
+    assert (np.diff(numbers, axis=1) >= 0).all()
+
+
+def test_more_than_a_network_holds():
+    numbers = np.random.default_rng(0).permutation(1000)
+    for i, j in comparisons(1000):
+        numbers[i], numbers[j] = min(numbers[i], numbers[j]), max(numbers[i], numbers[j])
+    assert (numbers == np.arange(1000)).all()
+
+
+def test_queues_of_any_length_are_sorted_with_what_belongs_to_them():
+    random = np.random.default_rng(1)
+    plane = LANES + 3
+    keys = random.standard_normal((LONGEST, plane)).astype(np.float32)
+    held = np.array([0, 1, 2, 5, 8, 11, 15, 16], np.int32)
+    opacities, ids = 2 * keys, np.arange(keys.size, dtype=np.int32).reshape(keys.shape)
+    given, given_ids = keys.copy(), ids.copy()
+    assert _sort_queues(keys.ravel(), opacities.ravel(), ids.ravel(), held, plane, _NONE) == 0
+    for lane, count in enumerate(held):
+        order = np.argsort(-given[:count, lane])
+        assert (keys[:count, lane] == given[order, lane]).all()
+        assert (opacities[:count, lane] == 2 * given[order, lane]).all()
+        assert (ids[:count, lane] == given_ids[order, lane]).all()
+        assert (keys[count:, lane] == _NONE).all()
+    assert (keys[:, LANES:] == given[:, LANES:]).all()
+
+
+def test_ties_are_told():
+    keys = np.tile(np.arange(LONGEST, dtype=np.float32)[:, None], (1, LANES))
+    keys[3, 2], keys[9, 5], keys[12, 7] = keys[11, 2], keys[1, 5], keys[5, 7]
+    held = np.array([LONGEST] * 7 + [12], np.int32)  # the last lane's tie lies behind its end
+    opacities, ids = keys.copy(), np.zeros(keys.shape, np.int32)
+    assert _sort_queues(keys.ravel(), opacities.ravel(), ids.ravel(), held, LANES, _NONE) == 1 << 2 | 1 << 5
