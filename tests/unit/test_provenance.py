@@ -17,8 +17,10 @@ def copy(tmp_path, monkeypatch):
     """A copy of the package that may be edited, and a function that digests a verb of it afresh."""
     shutil.copytree(SOURCE, tmp_path / "nbavatar", ignore=shutil.ignore_patterns("__pycache__", "assets"))
     monkeypatch.setattr(imports, "ROOT", tmp_path / "nbavatar")
-    caches = (provenance.code_digest, provenance.code_modules, provenance._tree, provenance._normalised,
-              imports.source_of, imports._text, imports.is_neutral, imports.imports_of)  # fmt: skip
+    caches = (
+        *(provenance.code_digest, provenance.code_modules),
+        *(imports.source_of, imports._text, imports.is_neutral, imports.imports_of),
+    )
 
     def digest(verb, method=None):
         for function in caches:

@@ -124,11 +124,12 @@ def test_a_full_disk_keeps_nothing_and_stops_nothing(package):
 
 def test_what_another_user_prepared_is_passed_over(public_folder, monkeypatch, caplog):
     """The other has made the folders that we would use, closed and open, and a link to one of the victim's."""
+    from nbavatar import private
     from nbavatar.jit import cache as kernels
 
     package = public_folder / "package"
     package.mkdir(mode=0o755)
-    monkeypatch.setattr(kernels, "ROOT", package)
+    monkeypatch.setattr(private, "ROOT", package)
     name = f"jit.lanes-{kernels.sources_digest(('nbavatar.jit.lanes',))}"
     theirs = public_folder / "named" / "nbavatar" / name
     as_user(OTHER, lambda: (os.umask(0), theirs.mkdir(parents=True, mode=0o777)))
