@@ -10,6 +10,7 @@ Results go to `results/<run>/`, logs to `logs/<run>/`. The same command again do
 follows `--` goes to snakemake: `-- -n` shows what would run, `-- subject_S2` makes one subject, `-- --configfile FILE`
 takes other options. Configuration files are read first, and refused in one line where they are none. What a run that
 was killed has left, processes and Snakemake's lock, is cleared away first. Needs the packages of the extra `pipeline`.
+With `--profile slurm` every job goes to the cluster's queue (docs/cluster.md).
 """
 
 import argparse
@@ -45,6 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         if name == "capture":
             own.add_argument("folder", metavar="FOLDER", help="the capture")
         own.add_argument("--cores", type=int, metavar="N", help="processors to use (default: all)")
+        own.add_argument("--profile", metavar="NAME", help="where jobs run, if not on this machine: slurm, kubernetes, "
+                         "or the folder of a profile of snakemake's")  # fmt: skip
 
 
 class _Parser(argparse.ArgumentParser):
@@ -75,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
         if code:
             return code
     # The jobs of the smoke run take a second or two each: the profile and `nbavatar warm` are for such.
-    code = run_workflow(words, warm=args.what == "smoke")
+    code = run_workflow(words, warm=args.what == "smoke" and args.profile is None)
     report = here / "results" / args.what / "report" / "index.html"
     if code == 0 and report.is_file() and not args.snakemake:
         if args.what == "smoke":
@@ -88,7 +91,9 @@ def main(args: argparse.Namespace) -> int:
 def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:
     cores = str(args.cores or os.cpu_count() or 2)
     words = [sys.executable, "-m", "snakemake", "--snakefile", str(source / "Snakefile"), "--cores", cores]
-    if args.what == "smoke":
+    if args.profile is not None:
+        words += ["--workflow-profile", str(_profile(args.profile, source))]
+    elif args.what == "smoke":
         words += ["--workflow-profile", str(source / "profiles" / "ci")]
     words += args.snakemake
     given = read_words(args.snakemake)
@@ -101,6 +106,15 @@ def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:
         # it takes the last.
         words += ["--config", *given.values, f"data_root={json.dumps(args.folder, ensure_ascii=False)}"]
     return words
+
+
+def _profile(name: str, source: Path) -> Path:
+    """The folder of a profile: one of the user's, or ours of that name."""
+    for folder in (Path(name), source / "profiles" / name):
+        if any((folder / "config").with_suffix(ending).is_file() for ending in (".yaml", ".v8+.yaml")):
+            return folder.resolve()
+    ours = ", ".join(sorted(path.name for path in (source / "profiles").iterdir() if path.is_dir()))
+    raise DataError.of(name, expected=f"the folder of a profile, with a config.yaml in it, or one of {ours}", found="none")
 
 
 def pipeline_folder() -> Path:
