@@ -111,10 +111,12 @@ def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:
 def _profile(name: str, source: Path) -> Path:
     """The folder of a profile: one of the user's, or ours of that name."""
     for folder in (Path(name), source / "profiles" / name):
-        if any((folder / "config").with_suffix(ending).is_file() for ending in (".yaml", ".v8+.yaml")):
+        if any(path.is_file() for stem in ("profile", "config") for path in folder.glob(f"{stem}*.yaml")):
             return folder.resolve()
     ours = ", ".join(sorted(path.name for path in (source / "profiles").iterdir() if path.is_dir()))
-    raise DataError.of(name, expected=f"the folder of a profile, with a config.yaml in it, or one of {ours}", found="none")
+    raise DataError.of(
+        name, expected=f"the folder of a profile, with a profile.yaml in it, or one of {ours}", found="none"
+    )
 
 
 def pipeline_folder() -> Path:
