@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from nbavatar.errors import DataError
+from nbavatar.io.arrays import as_numbers
 from nbavatar.io.pickles import read_array, read_pickle
 
 __all__ = [
@@ -167,7 +168,8 @@ def landmark_arrays(content: Any, face_count: int, where: str) -> LandmarkArrays
         raise DataError.of(where, expected="a dictionary of arrays", found=type(content).__name__)
 
     def pair(name: str, lead: tuple[int | None, ...]) -> tuple[np.ndarray, np.ndarray]:
-        raw = np.asarray(content[f"{name}_lmk_faces_idx"]) if f"{name}_lmk_faces_idx" in content else None
+        key = f"{name}_lmk_faces_idx"
+        raw = _numbers(content[key], where, key) if key in content else None
         squeeze = raw is not None and raw.ndim == len(lead) + 1 and raw.shape[0] == 1
         outer: tuple[int | None, ...] = (1, *lead) if squeeze else lead
         faces = _integers(content, f"{name}_lmk_faces_idx", where, outer)
@@ -192,18 +194,24 @@ def _array(content: Mapping[str, Any], key: str, where: str, shape: tuple[int | 
     value = content[key]
     if hasattr(value, "toarray"):
         # The shape is checked first: a sparse matrix may claim any size.
+        if None in shape:
+            raise DataError.of(where, key, expected="an array", found="a sparse matrix")
         _check_shape(tuple(value.shape), shape, where, key)
         value = value.toarray()
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise DataError.of(where, key, expected="an array of numbers", found=type(value).__name__) from None
+    array = _numbers(value, where, key)
     _check_shape(array.shape, shape, where, key)
     if not np.isfinite(array).all():
         raise DataError.of(
             where, key, expected="finite numbers", found=f"{int((~np.isfinite(array)).sum())} NaN or infinite"
         )
     return array
+
+
+def _numbers(value: Any, where: str, key: str) -> np.ndarray:
+    try:
+        return np.array(as_numbers(value), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise DataError.of(where, key, expected="an array of numbers", found=type(value).__name__) from None
 
 
 def _integers(content: Mapping[str, Any], key: str, where: str, shape: tuple[int | None, ...]) -> np.ndarray:

@@ -283,8 +283,9 @@ def _far_from_origin(verts: np.ndarray) -> np.ndarray:
 
 def _near(verts: np.ndarray, origin: np.ndarray, path: Path, name: str) -> np.ndarray:
     """Vertices float32 `[V, 3]` seen from an origin."""
-    moved = verts.astype(np.float64) - origin
-    step = float(np.spacing(np.float32(np.abs(moved).max())))
+    moved = verts.astype(np.float64)
+    moved -= origin
+    step = float(np.spacing(np.float32(max(moved.max(), -moved.min()))))
     if verts.dtype == np.float32:
         step = max(step, float(np.spacing(np.abs(verts).max())))
     if step > _COARSE:

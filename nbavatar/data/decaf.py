@@ -22,7 +22,7 @@ import numpy as np
 from nbavatar.camera.distortion import checked_coefficients
 from nbavatar.camera.pinhole import Camera
 from nbavatar.errors import DataError, describe, did_you_mean, parsing
-from nbavatar.io.arrays import read_array_header
+from nbavatar.io.arrays import as_numbers, read_array_header
 from nbavatar.io.pickles import read_array, read_pickle
 from nbavatar.io.video import probe_video
 from nbavatar.names import check_name
@@ -344,7 +344,7 @@ def _matrix(entry: Mapping[Any, Any], name: str, shapes: Sequence[tuple[int, int
     if name not in entry:
         raise DataError.of(where, name, expected=f"a {wanted} matrix", found=f"only {', '.join(map(str, entry))}")
     try:
-        matrix = np.array(entry[name], dtype=np.float64)
+        matrix = np.array(as_numbers(entry[name]), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise DataError.of(where, name, expected=f"a {wanted} matrix", found=describe(entry[name])) from None
     if matrix.shape not in shapes or not np.isfinite(matrix).all():
@@ -357,8 +357,8 @@ def _distortion(entry: Mapping[Any, Any], where: str) -> tuple[str | None, np.nd
     named = [key for key in _DISTORTION_KEYS if key in entry]
     named += [key for key in entry if key not in named and "dist" in str(key).lower()]
     for key in named:
-        if entry[key] is not None and np.size(entry[key]):
-            return str(key), checked_coefficients(entry[key], f"{where}: {key}")
+        if entry[key] is not None and as_numbers(entry[key]).size:
+            return str(key), checked_coefficients(as_numbers(entry[key]), f"{where}: {key}")
     return None, None
 
 
@@ -366,6 +366,6 @@ def _parameter(frame: Any, part: str, name: str, where: str) -> np.ndarray:
     if not isinstance(frame, Mapping) or not isinstance(frame.get(part), Mapping) or name not in frame[part]:
         raise DataError.of(where, f"{part}.{name}", expected="a vector", found="none")
     try:
-        return np.asarray(frame[part][name], dtype=np.float64).reshape(-1)
+        return np.asarray(as_numbers(frame[part][name]), dtype=np.float64).reshape(-1)
     except (TypeError, ValueError, OverflowError):
         raise DataError.of(where, f"{part}.{name}", expected="a vector of numbers", found="something else") from None

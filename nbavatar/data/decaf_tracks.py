@@ -28,7 +28,8 @@ from nbavatar.data.decaf import (
     read_parameters,
 )
 from nbavatar.data.sequences import MeshSequence, Part
-from nbavatar.errors import DataError
+from nbavatar.errors import DataError, parsing
+from nbavatar.io.arrays import as_numbers
 from nbavatar.io.pickles import read_array, read_pickle
 
 __all__ = ["build_tracks", "frame_id"]
@@ -152,7 +153,7 @@ def _own_shape(
         shape = np.median(frames, axis=0)
         if stored is not None:
             try:
-                shape = np.asarray(stored[part][name], dtype=np.float32).reshape(-1)
+                shape = np.asarray(as_numbers(stored[part][name]), dtype=np.float32).reshape(-1)
             except (KeyError, TypeError, ValueError):
                 raise DataError.of(path, f"{part}.{name}", expected="a vector", found="none") from None
             if shape.shape != frames.shape[1:] or not np.isfinite(shape).all():
@@ -255,7 +256,8 @@ def _contacts(
 
 def _vertex_ids(subject: DecafSubject, file: str, vertices: int) -> np.ndarray:
     path = subject.asset(file)
-    ids = np.asarray(read_array(path)).reshape(-1)
+    with parsing(path, "vertex ids"):
+        ids = as_numbers(read_array(path)).reshape(-1)
     if ids.dtype.kind not in "iuf" or (len(ids) and (ids.min() < 0 or ids.max() >= vertices)):
         found = f"{ids.min()} to {ids.max()}" if ids.dtype.kind in "iuf" else str(ids.dtype)
         raise DataError.of(path, expected=f"vertex ids from 0 to {vertices - 1}", found=found)

@@ -4,21 +4,22 @@ import json
 import os
 import warnings
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from typing import IO, Any
 
 import numpy as np
 
 from nbavatar.errors import DataError, parsing
-from nbavatar.io.archives import open_archive
+from nbavatar.io.archives import open_archive, read_record
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.records import canonical_json
 
-__all__ = ["check_text", "read_array_header", "read_arrays", "read_plain_array", "write_arrays"]
+__all__ = ["as_numbers", "check_text", "read_array_header", "read_arrays", "read_plain_array", "write_arrays"]
 
 _RECORD = "record.json"
 _LAST_CHARACTER = 0x10FFFF
+_LARGEST_NUMBER = 16  # bytes, of a complex one
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -48,6 +49,10 @@ def read_arrays(
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Reads what `write_arrays` wrote, or any plain `.npz` (its record is then empty).
 
+    Args:
+        path: the file.
+        required: names of arrays that have to be there.
+
     Raises:
         DataError: the file is missing or damaged, or an array of `required` is not in it.
     """
@@ -57,7 +62,7 @@ def read_arrays(
             if entry.filename.endswith(".npy"):
                 with archive.open(entry) as stream:
                     arrays[entry.filename[:-4]] = read_plain_array(stream, entry.file_size)
-        record = json.loads(archive.read(_RECORD)) if _RECORD in archive.namelist() else {}
+        record = json.loads(read_record(archive, _RECORD)) if _RECORD in archive.namelist() else {}
         if not isinstance(record, dict):
             raise ValueError(f"{_RECORD} is no record")
     for name in required:
@@ -113,3 +118,30 @@ def check_text(array: np.ndarray) -> np.ndarray:
         if codes.max() > _LAST_CHARACTER:
             raise ValueError("text with numbers that are no characters")
     return array
+
+
+def as_numbers(value: Any, take: Callable[[int], None] = lambda count: None) -> np.ndarray:
+    """Numbers in nested lists as an array; what is an array already stays as it is.
+
+    Text is refused: of one long text and many short ones numpy makes an array that is as wide as the long one.
+
+    Args:
+        value: a number, an array, or lists or tuples of such.
+        take: is told the bytes that are about to be asked for; may raise.
+
+    Raises:
+        ValueError: something else than numbers, or lists of unequal lengths.
+    """
+    if isinstance(value, np.ndarray):
+        return value
+    pending = [value]
+    while pending:
+        part = pending.pop()
+        if isinstance(part, (list, tuple)):
+            take(_LARGEST_NUMBER * len(part))
+            pending.extend(part)
+        elif isinstance(part, np.ndarray) and part.dtype.kind in "biufc":
+            take(_LARGEST_NUMBER * part.size)
+        elif not isinstance(part, (bool, int, float, complex, np.number, np.bool_)):
+            raise ValueError(f"a {type(part).__name__} among numbers")
+    return np.asarray(value)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nbavatar.errors import StorageError, parsing, require
-from nbavatar.io.archives import open_archive
+from nbavatar.io.archives import open_archive, read_record
 from nbavatar.io.atomic import atomic_write, storage_errors, temporary_beside
 from nbavatar.io.forms import check_form
 from nbavatar.io.records import canonical_json
@@ -90,7 +90,7 @@ def read_vertex_maps(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray
         parsing(path, "vertex maps (.exr.zip)"),
         open_archive(path) as archive,
     ):
-        layout = json.loads(archive.read("manifest.json"))
+        layout = json.loads(read_record(archive, "manifest.json"))
         check_form(layout, _FORM, path, "manifest.json")
         count = len(layout["frames"])
         for name, entry in layout["maps"].items():

@@ -26,7 +26,7 @@ from typing import Any, Self
 import numpy as np
 
 from nbavatar.errors import DataError, describe, parsing
-from nbavatar.io.archives import open_archive
+from nbavatar.io.archives import open_archive, read_record
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.forms import check_form, matrix_form
 from nbavatar.io.images import decode_image, encode_png
@@ -105,7 +105,7 @@ class FramePack:
         self.path = Path(path)
         with parsing(path, "a frame pack (.zip)", damaged="a damaged file"), contextlib.ExitStack() as opening:
             self._archive = opening.enter_context(open_archive(self.path))
-            self.manifest: dict[str, Any] = json.loads(self._archive.read(_MANIFEST))
+            self.manifest: dict[str, Any] = json.loads(read_record(self._archive, _MANIFEST))
             _check_manifest(self.manifest, self.path)
             opening.pop_all()  # stays open
         self.frames: list[str] = list(self.manifest["frames"])

@@ -15,13 +15,15 @@ from typing import Any
 import numpy as np
 
 from nbavatar.errors import describe
-from nbavatar.io.arrays import check_text
-from nbavatar.io.unpickler import Budget, Function, Refused, Shim, checked_key, describe_class
+from nbavatar.io.arrays import as_numbers, check_text
+from nbavatar.io.pickle_limits import Budget, Refused, checked_key
+from nbavatar.io.unpickler import Function, Metered, Shim, describe_class
 
 __all__ = ["ALLOWED"]
 
 _SPARSE_FORMATS = ("csc", "csr", "coo")
 _DTYPE_LETTERS = tuple("biufcSUO?")
+_MAX_AXES = 64  # numpy's own
 
 Plain = Callable[[Any], Any]
 
@@ -30,28 +32,27 @@ class _Ch(Shim):
     __slots__ = ()
 
     def value(self, plain: Plain, budget: Budget) -> np.ndarray:
-        return _as_array(plain(self.state["x"]), budget)
+        return as_numbers(plain(self.state["x"]), budget.take)
 
 
 class _Select(Shim):
     __slots__ = ()
 
     def value(self, plain: Plain, budget: Budget) -> np.ndarray:
-        source, index = _as_array(plain(self.state["a"]), budget), plain(self.state["idxs"])
+        source, index = as_numbers(plain(self.state["a"]), budget.take), plain(self.state["idxs"])
         # A slice gives a view, which takes nothing; anything else as many numbers as it names.
         if not isinstance(index, slice):
-            index = _as_array(index, budget)
+            index = as_numbers(index, budget.take)
             budget.take(index.size * source.itemsize)
         picked = source.ravel()[index]
         shape = plain(self.state.get("preferred_shape"))
-        return picked if shape is None else picked.reshape(tuple(int(n) for n in shape))
+        return picked if shape is None else picked.reshape(_shape(shape))
 
 
-def _as_array(value: Any, budget: Budget) -> np.ndarray:
-    array = np.asarray(value)
-    if array is not value:
-        budget.take(array.nbytes)
-    return array
+def _shape(value: Any) -> tuple[int, ...]:
+    if not isinstance(value, (list, tuple, np.ndarray)) or len(value) > _MAX_AXES:
+        raise ValueError("a shape that is none")
+    return tuple(int(n) for n in value)
 
 
 class _Sparse(Shim):
@@ -62,12 +63,14 @@ class _Sparse(Shim):
         import scipy.sparse
 
         state = {key.lstrip("_"): plain(value) for key, value in self.state.items()}
-        shape = tuple(int(n) for n in state["shape"])
-        if len(shape) != 2:
-            raise ValueError("a sparse matrix of other than two axes")
+        shape = _shape(state["shape"])
         parts = state.get("coords") or tuple(state.get(name) for name in _SPARSE_PARTS[self.layout])
-        arrays = [np.asarray(part) for part in (state["data"], *parts)]
-        budget.take(sum(array.nbytes for array in arrays))
+        if len(shape) != 2 or len(parts) != 2:
+            raise ValueError("a sparse matrix of other than two axes")
+        arrays = [as_numbers(part, budget.take) for part in (state["data"], *parts)]
+        if any(array.dtype.kind not in "biufc" for array in arrays):
+            raise ValueError("a sparse matrix of something else than numbers")
+        budget.take(2 * sum(array.nbytes for array in arrays))
         if self.layout == "coo":
             return scipy.sparse.coo_array((arrays[0], tuple(arrays[1:])), shape=shape)
         build = scipy.sparse.csc_array if self.layout == "csc" else scipy.sparse.csr_array
@@ -135,11 +138,11 @@ class _Array(Shim):
 
     def value(self, plain: Plain, budget: Budget) -> np.ndarray:
         dtype, content = _dtype(self.state["dtype"]), self.state["content"]
-        shape = tuple(int(n) for n in self.state["shape"])
+        shape = _shape(self.state["shape"])
         order = "F" if self.state["fortran"] else "C"
         if not dtype.hasobject:
+            budget.take(len(content))
             raw = _raw(content)
-            budget.take(len(raw))
             return check_text(np.frombuffer(raw, dtype=dtype)).reshape(shape, order=order).copy(order="K")
         if not isinstance(content, list):
             raise ValueError("an array of objects without a list")
@@ -200,7 +203,7 @@ class _FromBuffer(Shim):
         if not isinstance(raw, (bytes, bytearray, memoryview)):
             raise ValueError(f"a buffer that is a {type(raw).__name__}")
         budget.take(len(raw))
-        order, shape = self.state["order"], tuple(int(n) for n in self.state["shape"])
+        order, shape = self.state["order"], _shape(self.state["shape"])
         flat = check_text(np.frombuffer(bytearray(raw), dtype=_dtype(self.state["dtype"])))
         return flat.reshape(shape, order="F" if order == "F" else "C")
 
@@ -227,9 +230,8 @@ class _Storage(Shim):
     def value(self, plain: Plain, budget: Budget) -> Any:
         from nbavatar.io.tensors import parse_storage  # torch is imported only if a file holds a tensor
 
-        content = _raw(self.state["content"])
-        budget.take(len(content))
-        return parse_storage(content)
+        budget.take(len(self.state["content"]))
+        return parse_storage(_raw(self.state["content"]), budget)
 
 
 class _Tensor(Shim):
@@ -255,14 +257,14 @@ class _Tensor(Shim):
 def _container(kind: type) -> Callable[..., Any]:
     """A constructor of containers that copies a container of the file, and nothing else."""
 
-    def build(items: Any = ()) -> Any:
+    def build(budget: Budget, items: Any = ()) -> Any:
         if not isinstance(items, (list, tuple, set, frozenset, dict)):
             raise Refused(f"a {kind.__name__} of a {type(items).__name__}")
         if kind in (set, frozenset):
-            return kind(checked_key(item) for item in items)
+            return kind(checked_key(item, budget) for item in items)
         if kind in (dict, collections.OrderedDict):
             pairs = items.items() if isinstance(items, dict) else items
-            return kind((checked_key(key), value) for key, value in pairs)
+            return kind((checked_key(key, budget), value) for key, value in pairs)
         return kind(items)
 
     return build
@@ -295,7 +297,7 @@ def _slice(*limits: Any) -> slice:
 
 def _table() -> dict[tuple[str, str], Any]:
     table: dict[tuple[str, str], Any] = {
-        ("collections", "OrderedDict"): Function(_container(collections.OrderedDict)),
+        ("collections", "OrderedDict"): Metered(_container(collections.OrderedDict)),
         ("_codecs", "encode"): Function(_encode),
         ("numpy", "ndarray"): _Array,
         ("numpy", "dtype"): _Dtype,
@@ -308,7 +310,7 @@ def _table() -> dict[tuple[str, str], Any]:
         table[module, "_reconstructor"] = Function(_reconstructor)
     for module in ("__builtin__", "builtins"):
         for kind in (set, frozenset, list, tuple, dict):
-            table[module, kind.__name__] = Function(_container(kind))
+            table[module, kind.__name__] = Metered(_container(kind))
         for kind in (int, float, bool, complex):
             table[module, kind.__name__] = Function(_number(kind))
         table[module, "long"] = Function(_number(int))

@@ -18,8 +18,9 @@ import numpy as np
 
 from nbavatar.errors import DataError, parsing
 from nbavatar.io.arrays import read_array_header, read_plain_array
+from nbavatar.io.pickle_limits import Budget, Refused
 from nbavatar.io.pickle_types import ALLOWED
-from nbavatar.io.unpickler import Budget, Refused, Unpickler, plain
+from nbavatar.io.unpickler import Unpickler, plain
 
 __all__ = ["parse_pickle", "read_array", "read_pickle"]
 

@@ -20,7 +20,8 @@ from torch import Tensor
 
 from nbavatar.errors import DataError, parsing
 from nbavatar.io.archives import open_archive
-from nbavatar.io.unpickler import Budget, Function, Refused, Shim, Unpickler, plain
+from nbavatar.io.pickle_limits import Budget, Refused
+from nbavatar.io.unpickler import Function, Shim, Unpickler, plain
 
 __all__ = ["parse_storage", "read_tensors", "rebuilt"]
 
@@ -63,9 +64,11 @@ def rebuilt(storage: Any, offset: Any, size: Any, stride: Any, *_: Any) -> Tenso
     """
     if not isinstance(storage, _Storage):
         raise Refused(f"a tensor on a {type(storage).__name__}")
+    if any(not isinstance(part, (tuple, list)) or len(part) > _MAX_AXES for part in (size, stride)):
+        raise ValueError("a tensor of impossible shape")
     axes = [(int(n), int(step)) for n, step in zip(size, stride, strict=True)]
     offset, total = int(offset), storage.flat.numel()
-    if offset < 0 or len(axes) > _MAX_AXES or any(n < 0 or step < 0 for n, step in axes):
+    if offset < 0 or any(n < 0 or step < 0 for n, step in axes):
         raise ValueError("a tensor of impossible shape")
     count = 1
     for n, _step in axes:
@@ -124,7 +127,10 @@ def read_tensors(path: str | os.PathLike[str], expected: str, fix: str = "") -> 
     Raises:
         DataError: missing, damaged, sizes that disagree, or anything outside the allow-list (its name is said).
     """
-    with parsing(path, expected, damaged="a damaged or foreign file", fix=fix), open_archive(path) as archive:
+    with (
+        parsing(path, expected, damaged="a damaged or foreign file", fix=fix),
+        open_archive(path, stored=True) as archive,
+    ):
         [pickled] = [name for name in archive.namelist() if name.endswith("/data.pkl")]
         folder = pickled.removesuffix("data.pkl")
         if f"{folder}byteorder" in archive.namelist() and archive.read(f"{folder}byteorder") != b"little":
@@ -155,8 +161,12 @@ def read_tensors(path: str | os.PathLike[str], expected: str, fix: str = "") -> 
             ) from None  # fmt: skip
 
 
-def parse_storage(content: bytes) -> _Storage:
+def parse_storage(content: bytes, budget: Budget) -> _Storage:
     """`torch.storage._load_from_bytes`: the storage in a stream of pickles of older versions.
+
+    Args:
+        content: the stream.
+        budget: of the file that it is part of.
 
     Raises:
         ValueError: another format, or sizes that disagree.
@@ -168,7 +178,6 @@ def parse_storage(content: bytes) -> _Storage:
         described.append(_persistent(pid))
         return described[-1][1]
 
-    budget = Budget(len(content))
     magic, protocol, system = (Unpickler(stream, {}, budget).load() for _ in range(3))
     if (magic, protocol) != (_MAGIC, _PROTOCOL) or system.get("little_endian") is not True:
         raise ValueError("a storage in another format")

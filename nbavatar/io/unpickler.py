@@ -5,11 +5,12 @@ another twice are hashed in exponential time when they become keys, one opcode m
 bytes may stand for a structure that no printing or conversion ever finishes. So:
 
     names       answered from a table, else refused; states only for objects of ours (`Shim`)
-    keys        of dictionaries and sets: text, numbers, and tuples or frozensets of few of them
+    keys        of dictionaries and sets: text, real numbers, and tuples or frozensets of few of them, of which there
+                are at most `MAX_COMPOSITE_KEYS`, because whoever chooses them can make them collide
     opcodes     at most `MAX_OPCODES`; lengths never beyond the bytes that are there
     structure   no container that holds itself; no more entries than `MAX_ENTRIES`, counted as often as they are
                 referred to
-    arrays      together no more than `Budget` allows
+    memory      of all objects and copies together no more than `Budget` allows, asked before they are made
 
 The machine is the standard library's in Python (`pickle._Unpickler`, of which the one in C is a translation): its
 opcodes can be overridden one by one, and it keeps its memo in a dictionary, where the one in C allocates a table as
@@ -24,15 +25,15 @@ from typing import Any
 
 import numpy as np
 
+from nbavatar.io.pickle_limits import ORDERED_ENTRY, Budget, Refused, checked_key, weight
+
 __all__ = [
     "MAX_ENTRIES",
     "MAX_OPCODES",
-    "Budget",
     "Function",
-    "Refused",
+    "Metered",
     "Shim",
     "Unpickler",
-    "checked_key",
     "describe_class",
     "plain",
 ]
@@ -41,33 +42,17 @@ MAX_OPCODES = 16_000_000
 """Opcodes of one pickle; the largest file of the Decaf dataset has about a fifth."""
 MAX_ENTRIES = 16_000_000
 """Entries of all containers of one pickle, shared ones counted wherever they are shared; an array counts as one
-entry for every 16 numbers."""
-_KEY_PARTS = 64
-_LARGEST_KEY = 1 << 60
+entry for every 4 numbers, text for every 16 letters."""
+# Bytes that an opcode takes at most: the object, its growth with the first entries, and what `plain` notes of it.
+_ANY, _ENTRY, _SET_ITEM, _CALL = 48, 64, 112, 400
+_COST = {
+    "MARK": 64, "PUT": 100, "BINPUT": 100, "LONG_BINPUT": 100, "MEMOIZE": 100, "EMPTY_LIST": 300, "LIST": 300,
+    "EMPTY_DICT": 432, "DICT": 432, "EMPTY_SET": 432, "FROZENSET": 432, "TUPLE": 264, "TUPLE1": 264, "TUPLE2": 264,
+    "TUPLE3": 264, "NEWOBJ": _CALL, "NEWOBJ_EX": _CALL, "REDUCE": _CALL, "OBJ": _CALL, "INST": _CALL,
+}  # fmt: skip
 
 
 _Machine: Any = pickle._Unpickler  # type: ignore[attr-defined]
-
-
-class Refused(Exception):
-    """Something outside the allow-list; its text says what."""
-
-
-class Budget:
-    """Bytes that the arrays of one file may take together: what is reasonable for a file of this size.
-
-    Args:
-        file_bytes: size of the file.
-    """
-
-    def __init__(self, file_bytes: int) -> None:
-        self._left = (1 << 29) + 4 * file_bytes
-
-    def take(self, count: int) -> None:
-        """Counts an array of so many bytes; ValueError when the budget is spent."""
-        self._left -= count
-        if self._left < 0:
-            raise ValueError("its arrays take far more memory than the file has bytes")
 
 
 class Function:
@@ -86,6 +71,12 @@ class Function:
         raise Refused(f"assignment to {name} of a function")
 
 
+class Metered(Function):
+    """A callable that takes the budget of the file before its arguments."""
+
+    __slots__ = ()
+
+
 class Shim:
     """Collects the state of an object whose class is replaced by plain data after loading."""
 
@@ -95,8 +86,10 @@ class Shim:
         self.state: dict[str, Any] = {}
 
     def __setstate__(self, state: Any) -> None:
-        parts = state if isinstance(state, tuple) else (state,)
-        self.state = {str(key): value for part in parts if isinstance(part, dict) for key, value in part.items()}
+        parts = [part for part in (state if isinstance(state, tuple) else (state,)) if isinstance(part, dict)]
+        if not all(isinstance(key, str) for part in parts for key in part):
+            raise Refused("a state without names")
+        self.state = {key: value for part in parts for key, value in part.items()}
 
     def value(self, plain: Callable[[Any], Any], budget: Budget) -> Any:
         """The plain data that it stands for; `plain` resolves what it holds."""
@@ -147,19 +140,20 @@ class Unpickler(_Machine):
     def load_dict(self) -> None:
         """DICT: as the standard library's, keys checked."""
         items = self.pop_mark()
-        self.append({checked_key(items[i]): items[i + 1] for i in range(0, len(items), 2)})
+        self._budget.take(_ENTRY * len(items))
+        self.append({checked_key(items[i], self._budget): items[i + 1] for i in range(0, len(items), 2)})
 
     def load_setitem(self) -> None:
         """SETITEM."""
         value, key = self.stack.pop(), self.stack.pop()
-        _mapping(self.stack[-1])[checked_key(key)] = value
+        self._entered(self.stack[-1], 1)[checked_key(key, self._budget)] = value
 
     def load_setitems(self) -> None:
         """SETITEMS."""
         items = self.pop_mark()
-        target = _mapping(self.stack[-1])
+        target = self._entered(self.stack[-1], len(items) // 2)
         for i in range(0, len(items), 2):
-            target[checked_key(items[i])] = items[i + 1]
+            target[checked_key(items[i], self._budget)] = items[i + 1]
 
     def load_additems(self) -> None:
         """ADDITEMS."""
@@ -167,12 +161,14 @@ class Unpickler(_Machine):
         target = self.stack[-1]
         if type(target) is not set:
             raise Refused(f"items of a {type(target).__name__}")
-        target.update(checked_key(item) for item in items)
+        self._budget.take(_SET_ITEM * len(items))
+        target.update(checked_key(item, self._budget) for item in items)
 
     def load_frozenset(self) -> None:
         """FROZENSET."""
         items = self.pop_mark()
-        self.append(frozenset(checked_key(item) for item in items))
+        self._budget.take(_SET_ITEM * len(items))
+        self.append(frozenset(checked_key(item, self._budget) for item in items))
 
     def load_append(self) -> None:
         """APPEND."""
@@ -187,7 +183,7 @@ class Unpickler(_Machine):
     def load_bytearray8(self) -> None:
         """BYTEARRAY8: never more than there is to read."""
         count = int.from_bytes(self.read(8), "little")
-        if count > len(self._stream.getbuffer()):
+        if count > self._stream.getbuffer().nbytes:
             raise ValueError("a length beyond the end of the file")
         self.append(bytearray(self.read(count)))
 
@@ -195,6 +191,7 @@ class Unpickler(_Machine):
         """BUILD: states are for shims; an ordered dictionary's is dropped (torch keeps versions of layers there)."""
         state, target = self.stack.pop(), self.stack[-1]
         if isinstance(target, Shim):
+            self._budget.take(sum(map(weight, state)) if isinstance(state, tuple) else weight(state))
             target.__setstate__(state)
         elif type(target) is not collections.OrderedDict:
             raise Refused(f"a state of {type(target).__name__}")
@@ -230,22 +227,28 @@ class Unpickler(_Machine):
     def _called(self, call: Any, args: Any) -> Any:
         if not isinstance(args, tuple):
             raise Refused(f"a call with a {type(args).__name__}")
+        self._budget.take(weight(args) + sum(map(weight, args)))
         if not isinstance(call, Function):
             return _new(call, args)
-        result = call(*args)
-        if isinstance(result, (str, bytes, bytearray, list, tuple, dict, set, frozenset)):
-            self._budget.take(8 * len(result))
-        return result
+        return call(self._budget, *args) if isinstance(call, Metered) else call(*args)
+
+    def _entered(self, target: Any, count: int) -> Any:
+        """The mapping that is about to have so many more entries."""
+        if type(target) not in (dict, collections.OrderedDict):
+            raise Refused(f"entries of a {type(target).__name__}")
+        self._budget.take((_ENTRY if type(target) is dict else ORDERED_ENTRY) * count)
+        return target
 
     def get_extension(self, code: int) -> None:
         """EXT1, EXT2, EXT4: the registry of this process is none of a file's business."""
         raise Refused("an extension code")
 
-    def _counted(opcode: Callable[["Unpickler"], None]) -> Callable[["Unpickler"], None]:
+    def _counted(opcode: Callable[["Unpickler"], None], cost: int) -> Callable[["Unpickler"], None]:
         def run(self: "Unpickler") -> None:
             self._opcodes += 1
             if self._opcodes > MAX_OPCODES:
                 raise ValueError("far more entries than any file of the field has")
+            self._budget.take(cost)
             opcode(self)
 
         return run
@@ -258,8 +261,11 @@ class Unpickler(_Machine):
     }.items():  # fmt: skip
         dispatch[getattr(pickle, _name)[0]] = _handler
     for _code in dispatch:
-        dispatch[_code] = _counted(dispatch[_code])
-    del _name, _handler, _code, _counted
+        dispatch[_code] = _counted(dispatch[_code], _ANY)
+    for _name, _more in _COST.items():
+        _code = getattr(pickle, _name)[0]
+        dispatch[_code] = _counted(dispatch[_code], _more)
+    del _name, _handler, _code, _counted, _more
 
 
 def plain(value: Any, budget: Budget) -> Any:
@@ -281,7 +287,9 @@ class _Plain:
 
     def of(self, value: Any) -> tuple[Any, int]:
         """(result, number of entries)."""
-        if isinstance(value, (str, bytes, int, float)) or value is None:
+        if isinstance(value, (str, bytes)):
+            return value, 1 + len(value) // 16
+        if isinstance(value, (int, float)) or value is None:
             return value, 1
         key = id(value)
         if key in self._seen:
@@ -313,40 +321,8 @@ class _Plain:
             for index, (part, _) in zip(np.ndindex(value.shape), parts, strict=True):
                 value[index] = part
         else:
-            return value, 1 + (value.size // 16 if isinstance(value, np.ndarray) else 0)
+            return value, 1 + (value.size // 4 if isinstance(value, np.ndarray) else 0)
         return value, 1 + sum(count for _, count in parts)
-
-
-def checked_key(value: Any) -> Any:
-    """A key that is hashed and compared in a moment: `_hashable` counts its parts."""
-    if type(value) is str:
-        return value
-    if _hashable(value, _KEY_PARTS) < 0:
-        raise Refused("a key of many parts")
-    return value
-
-
-def _hashable(value: Any, left: int) -> int:
-    """How many parts are left of `left` after those of a key; below zero when there are more."""
-    if left <= 0:
-        return -1
-    if isinstance(value, (tuple, frozenset)):
-        for part in value:
-            left = _hashable(part, left - 1)
-            if left < 0:
-                break
-        return left
-    if isinstance(value, int) and abs(value) >= _LARGEST_KEY:
-        raise Refused("a key of so many digits")
-    if value is not None and not isinstance(value, (str, bytes, int, float, complex, np.generic)):
-        raise Refused(f"a key of class {type(value).__name__}")
-    return left
-
-
-def _mapping(target: Any) -> Any:
-    if type(target) not in (dict, collections.OrderedDict):
-        raise Refused(f"entries of a {type(target).__name__}")
-    return target
 
 
 def _list(target: Any) -> list:

@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -247,6 +248,8 @@ def test_gradcheck_of_the_decaf_head(flame):
         ("weights", np.ones((60, 5)), "sum to 1"),
         ("posedirs", None, "array of this name"),
         ("J_regressor", "text", "array of numbers"),
+        ("J_regressor", [["1" * 100, "1"]], "array of numbers"),
+        ("v_template", scipy.sparse.csc_array((1 << 40, 3)), "an array, found a sparse matrix"),  # 24 TB of zeros
         ("kintree_table", np.array([[2**32 - 1, 2, 1, 1, 1], [0, 1, 2, 3, 4]]), "parent before"),
     ],
 )

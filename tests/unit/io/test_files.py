@@ -46,6 +46,18 @@ def test_write_arrays_round_trips_and_its_bytes_depend_on_contents_only(tmp_path
     np.testing.assert_array_equal(np.load(tmp_path / "1.npz")["b.x"], arrays["b.x"])
 
 
+@pytest.mark.parametrize("name", ["a.npy", "record.json"])
+def test_what_unpacks_to_far_more_than_the_file_is_refused_before(tmp_path, name):
+    """What is unpacked grows further where it is converted, or parsed: numbers to float64, text to objects."""
+    count = {"a.npy": 80 << 20, "record.json": 2 << 20}[name]
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        header = f"{{'descr': '|i1', 'fortran_order': False, 'shape': ({count},), }}\n".encode()
+        start = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header if name == "a.npy" else b""
+        archive.writestr(name, start + bytes(count))
+    with pytest.raises(DataError, match=r"a\.npz: .* bytes that claims? to unpack to \d+"):
+        read_arrays(tmp_path / "a.npz")
+
+
 def test_read_arrays_names_what_is_wrong(tmp_path):
     with pytest.raises(DataError, match="no such file"):
         read_arrays(tmp_path / "none.npz")

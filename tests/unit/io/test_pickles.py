@@ -259,7 +259,29 @@ class _Call:
 
 _TUPLES = b"K\x00" + 60 * b"2\x86"  # DUP TUPLE2: ((((0, 0), (0, 0)), ...
 
+_LIST = b"](" + b"K\x01" * 20_000 + b"eq\x000"  # twenty thousand numbers, remembered
+_CHUMPY = b"cchumpy.ch\nCh\n)\x81"
+
 BOMBS = {
+    # numpy would make every text as wide as the longest.
+    "text among numbers": lambda: (
+        b"\x80\x02" + _CHUMPY + b"}X\x01\x00\x00\x00x](X" + (10**5).to_bytes(4, "little") + b"x" * 10**5
+        + b"X\x01\x00\x00\x00y" * 20_000 + b"esb."
+    ),
+    "sets of one list": lambda: b"\x80\x02" + _LIST + b"](c__builtin__\nset\nq\x01" + b"h\x00\x85R".join([b""] * 2) + (
+        b"h\x01h\x00\x85R" * 2000 + b"e."
+    ),
+    "ordered mappings of one": lambda: (
+        b"\x80\x02}(" + b"".join(b"J%sN" % n.to_bytes(4, "little") for n in range(20_000)) + b"uq\x000"
+        + b"](ccollections\nOrderedDict\nq\x01h\x00\x85R" + b"h\x01h\x00\x85R" * 1000 + b"e."
+    ),
+    "states of one mapping": lambda: (
+        b"\x80\x02}(" + b"".join(b"X\x05\x00\x00\x00%05dN" % n for n in range(20_000)) + b"uq\x000"
+        + b"](" + (_CHUMPY + b"h\x00b") * 4000 + b"e."
+    ),
+    "empty sets": lambda: b"\x80\x04(" + b"\x8f" * 3_500_000 + b"l.",
+    "keys that could collide": lambda: pickle.dumps({(k, -k): 0 for k in range(3000)}, protocol=2),
+    "complex keys, which collide": lambda: pickle.dumps(dict.fromkeys(complex(-1000003 * k, k) for k in range(2000))),
     # A tuple's hash is not remembered: twice the time for every level, ages for 130 bytes.
     "hash of a key": lambda: b"\x80\x02}" + _TUPLES + b"K\x01s.",
     "hash of a set's item": lambda: b"\x80\x04(" + _TUPLES + b"\x91.",
@@ -300,6 +322,7 @@ def test_bombs_are_refused_at_once(tmp_path, name):
         [sys.executable, "-c", code, tmp_path / "bomb.pkl"], capture_output=True, text=True, timeout=60, check=True
     )
     assert "bomb.pkl: pickle: " in done.stdout, done
+    assert "more memory than there is" not in done.stdout, done  # refused before it was asked for
 
 
 def test_chains_of_selects_are_refused_when_they_outgrow_their_file(tmp_path, chumpy):
