@@ -23,7 +23,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from nbavatar.cli.run_words import check_files, read_words
+from nbavatar.cli.run_words import check_files, profile_files, read_words
 from nbavatar.cli.supervision import run_workflow, wait
 from nbavatar.errors import DataError, DependencyError
 from nbavatar.packages import install_line
@@ -77,8 +77,9 @@ def main(args: argparse.Namespace) -> int:
         code = wait(subprocess.Popen(check))
         if code:
             return code
+    given = read_words(args.snakemake)
     # The jobs of the smoke run take a second or two each: the profile and `nbavatar warm` are for such.
-    code = run_workflow(words, warm=args.what == "smoke" and args.profile is None)
+    code = run_workflow(words, warm=args.what == "smoke" and args.profile is None and not given.profiles)
     report = here / "results" / args.what / "report" / "index.html"
     if code == 0 and report.is_file() and not args.snakemake:
         if args.what == "smoke":
@@ -110,13 +111,11 @@ def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:
 
 def _profile(name: str, source: Path) -> Path:
     """The folder of a profile: one of the user's, or ours of that name."""
-    for folder in (Path(name), source / "profiles" / name):
-        if any(path.is_file() for stem in ("profile", "config") for path in folder.glob(f"{stem}*.yaml")):
-            return folder.resolve()
-    ours = ", ".join(sorted(path.name for path in (source / "profiles").iterdir() if path.is_dir()))
-    raise DataError.of(
-        name, expected=f"the folder of a profile, with a profile.yaml in it, or one of {ours}", found="none"
-    )
+    found = profile_files(name, source)
+    if not found:
+        ours = ", ".join(sorted(path.name for path in (source / "profiles").iterdir() if path.is_dir()))
+        raise DataError.of(name, expected=f"a folder with a profile.yaml in it, or one of {ours}", found="none")
+    return found[0].parent.resolve()
 
 
 def pipeline_folder() -> Path:

@@ -16,7 +16,7 @@ from nbavatar.config.run import load_run
 from nbavatar.config.yamlfiles import check_tree, parse_yaml
 from nbavatar.errors import ConfigError, describe, parsing
 
-__all__ = ["Words", "check_files", "read_words"]
+__all__ = ["Words", "check_files", "profile_files", "read_words"]
 
 _EXPECTED = "a configuration in YAML"
 
@@ -75,7 +75,7 @@ def check_files(words: Words, configfiles: Sequence[str], source: Path) -> None:
         with parsing(words.snakefile, "a Snakefile", damaged="one that is no text", error=ConfigError):
             Path(words.snakefile).read_text(encoding="utf-8")
     for name in words.profiles:
-        for path in _profile_files(name, source):
+        for path in profile_files(name, source):
             _mapping(path)
     run: dict[str, Any] = {}
     for path in configfiles:
@@ -103,7 +103,7 @@ def _mapping(path: str | Path) -> dict[str, Any]:
     return value
 
 
-def _profile_files(name: str, source: Path) -> list[Path]:
+def profile_files(name: str, source: Path) -> list[Path]:
     """Configuration files of a profile, wherever it is found near by."""
     for place in (Path(name), Path("profiles", name), source / "profiles" / name):
         if place.is_file():

@@ -13,8 +13,9 @@ import stat
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["files_digest", "mesh_digest", "rig_digest", "supplied_digest", "supplied_place"]
+__all__ = ["files_digest", "given_digest", "mesh_digest", "rig_digest", "supplied_digest", "supplied_place"]
 
+_READ_WHOLE = 1_000_000  # bytes; snakemake compares files up to here by content, too
 _VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 
 
@@ -39,6 +40,26 @@ def rig_digest(root: str) -> str:
         except OSError:
             total.update(b"missing\0")
     return total.hexdigest()[:12]
+
+
+def given_digest(paths: Iterable[str]) -> str:
+    """Digest of single files: of what is in small ones, of size and time of large ones.
+
+    Times alone are compared with those of results, and do not tell of a file whose place an older one has taken: by a
+    copy that keeps times, from a backup, out of an archive.
+    """
+    return _joined(map(_file, paths))
+
+
+@functools.cache
+def _file(path: str) -> str:
+    try:
+        known = os.stat(path)
+        if known.st_size > _READ_WHOLE:
+            return f"{known.st_size} {known.st_mtime_ns}"
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError:
+        return "missing"
 
 
 def supplied_place(folder: str, subject: str, camera: str) -> Path | None:

@@ -1,10 +1,17 @@
 """Options of the synthetic dataset. Standard library only."""
 
 import dataclasses
+import json
+import os
+from pathlib import Path
 
 from nbavatar.config.core import option
+from nbavatar.errors import ConfigError
 
-__all__ = ["CAMERAS", "SUBJECTS", "SynthesizeConfig"]
+__all__ = ["CAMERAS", "RECORD", "SUBJECTS", "SynthesizeConfig", "refuse_others"]
+
+RECORD = "synthetic.json"
+"""By this file in it a synthetic dataset is known; it is there before anything else."""
 
 CAMERAS = ("084", "100", "102", "108", "110", "111", "121", "122")
 """Camera ids of the release."""
@@ -36,3 +43,24 @@ class SynthesizeConfig:
     )
     codec: str = option("mp4v", "FourCC code of the videos.")
     seed: int = option(0, "Seed of everything random.", min=0)
+
+
+def refuse_others(root: str | os.PathLike[str]) -> None:
+    """Lets a synthetic dataset be written only where there is none, or one that was made so: never over other files.
+
+    Raises:
+        ConfigError: the folder holds files, and no record of a synthetic dataset.
+    """
+    try:
+        known = "subjects" in json.loads(Path(root, RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError, RecursionError):
+        known = False
+    if known or not os.path.isdir(root):
+        return
+    for folder, _, files in os.walk(root):
+        for name in files:
+            raise ConfigError.of(
+                root, expected=f"a folder without files, or a synthetic dataset ({RECORD})",
+                found=os.path.relpath(os.path.join(folder, name), root),
+                fix="name another folder: what is made would take the place of these files",
+            )  # fmt: skip

@@ -84,6 +84,8 @@ def test_subjects_are_found_in_both_split_folders(project):
         (("--config", "run=a/b"), "config.run"),
         (("--config", "device=gpu"), "one of auto, cpu, cuda"),
         (("--config", "runs=config/none.tsv"), "config/none.tsv: expected a sheet"),
+        # The outputs of a job are removed before it starts: a dataset of the user's would be gone.
+        (("--config", "data_root=config"), "config: expected a folder without files, or a synthetic dataset"),
     ],
 )
 def test_configuration_errors_are_one_line_before_any_job(project, words, message):

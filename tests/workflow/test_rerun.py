@@ -143,6 +143,24 @@ def test_an_edit_of_printed_numbers_rebuilds_tables_only(edit):
     assert plan == {"table": 8, "report": 1}
 
 
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("config/reported.csv", {"table": 8, "report": 1}),
+        ("resources/synthetic/smoke/train/params/S2/params_smoothed.pkl", {"tracks": 1, "fit": 1, "ingest": 0}),
+        ("resources/synthetic/smoke/assets/generic_model.pkl", {"tracks": 1, "fit": 1, "reenact": 1, "ingest": 0}),
+    ],
+)
+def test_a_file_whose_place_an_older_one_takes_is_seen(finished, name, expected):
+    path = finished.folder / name
+    kept, times = path.read_text(), path.stat()
+    _older(name)(finished.folder)
+    plan = finished.plan()
+    path.write_text(kept)
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert {rule: plan.get(rule, 0) for rule in expected} == expected
+
+
 def test_a_touched_but_unchanged_input_runs_nothing(finished):
     path = finished.folder / "config/reported.csv"
     path.write_text(path.read_text())
@@ -218,6 +236,16 @@ def _edited(name):
     return edit
 
 
+def _older(name):
+    """By a file that is older than everything that was made: out of a backup, or copied with its times."""
+
+    def edit(root):
+        (root / name).write_text((root / name).read_text() + "\n")
+        os.utime(root / name, (10**9, 10**9))
+
+    return edit
+
+
 def _replaced(name):
     """By a rename, as editors save."""
 
@@ -267,6 +295,8 @@ EDITS = {
     ),
     "a mesh": (_edited("meshes/f2.npz"), MOVED),
     "a mesh replaced": (_replaced("meshes/f0.npz"), MOVED),
+    "the cameras, by an older file": (_older("cameras.json"), MOVED | {"ingest": 3}),
+    "the splits, by an older file": (_older("splits.json"), MOVED | {"ingest": 3}),
     "the topology": (_edited("meshes/topology.npz"), MOVED),
     "what is no frame": (_added("masks/c0/notes.txt"), {}),
     "a frame that splits.json leaves out": (_added("images/c0/f9.png"), {}),

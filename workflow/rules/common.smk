@@ -13,12 +13,14 @@ from snakemake.exceptions import WorkflowError
 from nbavatar.config.figures import read_figures
 from nbavatar.config.inputs import (
     files_digest,
+    given_digest,
     mesh_digest,
     rig_digest,
     supplied_digest,
 )
 from nbavatar.config.run import load_run, stage_options
 from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
+from nbavatar.config.synthetic import refuse_others
 from nbavatar.config.tables import read_tables
 from nbavatar.errors import NBAvatarError, did_you_mean
 from nbavatar.provenance import code_digest
@@ -36,6 +38,9 @@ try:
         SUBJECTS = capture_subjects(RUN.data_root, RUN.test_camera)
     else:
         SUBJECTS = read_subjects(RUN.subjects, RUN.data_root)
+    # Before snakemake knows that these files are outputs: those of a job are removed before it starts.
+    if RUN.synthetic:
+        refuse_others(RUN.data_root)
     ROWS = read_rows(RUN.runs, list(SUBJECTS))
     for row in ROWS:
         for kind, name, known in (
@@ -189,6 +194,21 @@ def looked_at(subjects):
     if RUN.layout != "capture":
         return []
     return [f"{R}/check/{subject}/overview.png" for subject in subjects]
+
+
+def given(files):
+    """Digest of input files that the user gave, for `params`: of these an older one is another one, too."""
+
+    def digest(wildcards):
+        found = files(wildcards) if callable(files) else files
+        return given_digest([str(path) for path in found])
+
+    return digest
+
+
+def given_data(files):
+    """The same for files of the dataset, which are the run's own where it is synthetic."""
+    return "" if RUN.synthetic else given(files)
 
 
 # The folders of a capture hold too many files to be inputs one by one, and the times of folders do not tell of files

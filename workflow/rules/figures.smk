@@ -24,6 +24,7 @@ rule reenact:
             if RUN.layout == "decaf"
             else []
         ),
+        given=given_data(assets()) if RUN.layout == "decaf" else "",
         code=code_digest("reenact"),
     shell:
         "nbavatar reenact --source {input.source:q} --target {input.target:q} {params.assets:q}"
@@ -104,6 +105,7 @@ rule figure:
         runtime="30m",
     params:
         stem=lambda w, output: output.png[:-4],
+        given=given([RUN.figures] if RUN.figures else []),
         code=code_digest("figure"),
     shell:
         "nbavatar figure --figure {wildcards.figure:q} --layout {input.layout:q} --renders {input.renders:q}"

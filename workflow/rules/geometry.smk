@@ -36,6 +36,7 @@ if RUN.layout == "decaf":
             runtime="8h",
         params:
             assets=Path(RUN.data_root) / "assets",
+            given=given_data(assets()),
             cfg=options("fit"),
             code=code_digest("fit"),
         shell:

@@ -100,6 +100,7 @@ rule ingest:
         root=root,
         layout=RUN.layout,
         files=files_of_images,
+        given=given_data(raw_files),
         only="--images-only" if RUN.layout == "capture" else "",
         cfg=options("ingest"),
         code=code_digest("ingest"),
@@ -124,6 +125,7 @@ rule tracks:
         layout=RUN.layout,
         cameras=cameras,
         files=files_of_meshes,
+        given=given_data(raw_tracks),
         cfg=options("tracks"),
         code=code_digest("tracks"),
     shell:

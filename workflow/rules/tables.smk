@@ -29,6 +29,7 @@ rule table:
         runtime="10m",
     params:
         stem=lambda w, output: output.csv[:-4],
+        given=given([RUN.tables, RUN.reported]),
         label=RUN.size_label,
         cfg=options("table"),
         code=code_digest("table"),

@@ -39,6 +39,7 @@ rule tradeoff:
         runtime="8h",
     params:
         what="--no-store",
+        given=given([RUN.tradeoff.sheet]),
         device=RUN.device,
         folder=lambda w, output: Path(output.result).parent,
         protocol=lambda w: protocol_text(RUN.tradeoff.protocol),
@@ -89,6 +90,7 @@ rule offline:
         runtime="4h",
     params:
         folder=lambda w, output: Path(output.result).parent,
+        given=given([RUN.tradeoff.sheet]),
         code=code_digest("tradeoff"),
     shell:
         "nbavatar tradeoff --offline --meshes {input.meshes:q} --sheet {input.sheet:q} --out {params.folder:q}"

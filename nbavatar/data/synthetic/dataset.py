@@ -16,6 +16,7 @@ import numpy as np
 
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import Camera, project
+from nbavatar.config.synthetic import RECORD, refuse_others
 from nbavatar.data.synthetic.figure import build_figure, pose_figure
 from nbavatar.data.synthetic.legacy_pickle import dump_array, dump_legacy
 from nbavatar.data.synthetic.models import Human, flame_content, landmark_content, mano_content, mirrored_mano_content
@@ -83,11 +84,15 @@ def write_dataset(
 
     Raises:
         DataError: odd image size, or a codec that this OpenCV does not write.
+        ConfigError: the folder holds files of others.
     """
     if width % 2 or height % 2:
         raise DataError.of(
             "synthesize", "width, height", expected="even numbers (video codecs need them)", found=f"{width}x{height}"
         )
+    refuse_others(root)
+    about = {"subjects": list(subjects), "cameras": list(cameras), "mesh": mesh, **(record or {})}
+    write_json(root / RECORD, about | {"complete": False})
     bodies = build_bodies(mesh)
     write_assets(root, bodies.human)
     for name in subjects:
@@ -113,9 +118,7 @@ def write_dataset(
             workers=workers,
             progress=progress,
         )
-    write_json(
-        root / "synthetic.json", {"subjects": list(subjects), "cameras": list(cameras), "mesh": mesh, **(record or {})}
-    )
+    write_json(root / RECORD, about | {"complete": True})
 
 
 def write_assets(root: Path, human: Human) -> None:

@@ -177,3 +177,16 @@ def test_values_for_the_configuration_stay_beside_the_folder(calls, tmp_path, mo
     assert calls[-1][-4:] == ["--config", "run=mine", "device=cpu", 'data_root="data"']
     assert sum(word.startswith("--configfile") for word in calls[-1]) == 1
     assert main(["run", "capture", "data", "--", "--configfile", "own.yaml"]) == 0
+
+
+def test_a_profile_takes_the_place_of_the_warm_run(calls, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    slurm = str(ROOT / "profiles/slurm")
+    for words in (["--profile", "slurm"], ["--profile", slurm], ["--", "--workflow-profile", "slurm"]):
+        assert main(["run", "smoke", *words]) == 0
+    ours, folder, own = calls
+    assert ours[:2] == [sys.executable, "-m"] and ours == folder  # not warm: its jobs are elsewhere
+    assert ours[ours.index("--workflow-profile") + 1] == slurm
+    assert own[0] != "warm" and own[-4:-2] == ["--workflow-profile", "slurm"]
+    assert main(["run", "smoke", "--profile", "slrum"]) == 2
+    assert "slrum: expected a folder with a profile.yaml in it, or one of ci, " in capsys.readouterr().err

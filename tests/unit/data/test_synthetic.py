@@ -1,6 +1,7 @@
 """The synthetic dataset: what is on disk, what it means, and that the same seed gives the same bytes."""
 
 import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ from nbavatar.bodymodels.flame import Flame
 from nbavatar.bodymodels.mano import Mano, shorten_tips
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import project
-from nbavatar.config.synthetic import CAMERAS
+from nbavatar.config.synthetic import CAMERAS, RECORD, refuse_others
 from nbavatar.data.synthetic.dataset import write_dataset
-from nbavatar.errors import DataError
+from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.pickles import read_pickle
 from nbavatar.io.video import probe_video, read_video
 from nbavatar.math.rotations import axis_angle_to_matrix
@@ -217,3 +218,26 @@ def test_odd_sizes_and_unknown_codecs_are_one_line_and_leave_nothing(tmp_path: P
 
 def test_all_cameras_of_the_release_are_offered() -> None:
     assert CAMERAS == ("084", "100", "102", "108", "110", "111", "121", "122")
+
+
+def test_files_of_others_are_not_written_over(tmp_path):
+    """Whoever licensed the real thing cannot make it again; what was made so before is ours to make again."""
+    own = tmp_path / "assets" / "generic_model.pkl"
+    own.parent.mkdir()
+    own.write_bytes(b"licensed")
+    with pytest.raises(ConfigError, match=r"expected a folder without files.* found assets/generic_model.pkl"):
+        write_dataset(tmp_path, subjects=("S2",), **OPTIONS)
+    assert own.read_bytes() == b"licensed" and len(list(tmp_path.rglob("*"))) == 2
+    own.unlink()
+    refuse_others(tmp_path)
+    own.write_bytes(b"made before")
+    (tmp_path / RECORD).write_text('{"subjects": ["S2"]}')
+    refuse_others(tmp_path)
+
+
+def test_a_dataset_is_known_as_synthetic_before_it_is_whole(root):
+    assert json.loads((root / RECORD).read_text())["complete"] is True
+    with pytest.raises(DataError, match="codec"):
+        write_dataset(root.parent / "half", subjects=("S2",), **OPTIONS, codec="none!")
+    assert json.loads((root.parent / "half" / RECORD).read_text())["complete"] is False
+    refuse_others(root.parent / "half")
