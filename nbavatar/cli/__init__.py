@@ -42,6 +42,7 @@ VERBS = {
     "figure": "one figure for print: comparisons, features, cross-reenactment, contact, curves, Pareto fronts",
     "reenact": "drive one subject by another's poses",
     "video": "a turntable or a driven sequence as mp4",
+    "view": "an avatar in the browser: orbit, play, compare",
     "export": "an avatar or its meshes as .ply, .glb, .obj, .safetensors or .onnx",
     "report": "one self-contained HTML page with tables and pictures",
     "tradeoff": "speed against quality of an avatar, setting by setting; presets",

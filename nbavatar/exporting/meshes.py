@@ -38,6 +38,6 @@ def shapes_of(sequence: MeshSequence, rows: Sequence[int]) -> list[Shape]:
         if not there.any():
             continue
         verts[~there] = verts[there].mean(axis=(0, 1))
-        contact = contact_of(sequence, name, rows).any(axis=0)
+        contact = np.asarray(contact_of(sequence, name, rows).any(axis=0))
         shapes.append(Shape(name, verts, part.faces, colours=mesh_colours(contact)))
     return shapes

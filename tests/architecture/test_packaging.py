@@ -50,6 +50,7 @@ UNDECLARED = {
     "smplx": "its licence keeps it out; an oracle of tests where somebody has it",
     "jsonschema": "comes with snakemake; tests only",
     "packaging": "comes with pytest; tests only",
+    "websockets": "comes with viser; tests only",
     "llvmlite": "comes with numba, of the version that numba needs",
     "setuptools": "builds the package",
     "importlinter": "import-linter's package",
@@ -89,7 +90,7 @@ def _declared(*extras: str) -> list[Requirement]:
 
 def test_the_lock_holds_every_declared_package_in_a_version_that_fits():
     base, gpu = _pins("requirements.lock"), _pins("requirements-cuda.lock")
-    for requirement in _declared("pipeline", "export", "test", "lint"):
+    for requirement in _declared("pipeline", "view", "export", "test", "lint"):
         assert requirement.specifier.contains(base[canonicalize_name(requirement.name)]), requirement
     for requirement in _declared("cuda")[len(PROJECT["dependencies"]) :]:
         assert requirement.specifier.contains(gpu[canonicalize_name(requirement.name)]), requirement

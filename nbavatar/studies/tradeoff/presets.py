@@ -17,7 +17,15 @@ from nbavatar.io.forms import check_form
 from nbavatar.io.records import read_json, write_json
 from nbavatar.studies.tradeoff.front import POINT_FORM, Point, losses, pick_in_budget
 
-__all__ = ["Chosen", "budget_setting", "preset_entry", "preset_setting", "presets_path", "store_presets"]
+__all__ = [
+    "Chosen",
+    "budget_setting",
+    "preset_entry",
+    "preset_setting",
+    "presets_path",
+    "store_presets",
+    "stored_presets",
+]
 
 FORMAT = 1
 _KIND = "nbavatar presets"
@@ -108,6 +116,22 @@ def store_presets(
     }
     content = {"kind": _KIND, "format": FORMAT, "model": model, "measured": [*measured, entry]}
     write_json(path, content)
+
+
+def stored_presets(path: str | os.PathLike[str], model: str) -> list[str]:
+    """Names of the presets that a file holds; none where it is of another model.
+
+    Args:
+        path: file of `store_presets`.
+        model: digest of the model to render.
+
+    Raises:
+        DataError: no such file, or of another form.
+    """
+    content = read_json(path)
+    if not isinstance(content, dict) or content.get("model") != model:
+        return []
+    return list(dict.fromkeys(name for entry in _read(path, model) for name in entry["presets"]))
 
 
 def preset_setting(path: str | os.PathLike[str], name: str, *, model: str | None, device: str) -> Chosen:

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+from tests.browser import find_browser
 
 
 @pytest.fixture(scope="session")
 def browse(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[str, str]]:
     """``browse(page, screenshot=None, size=(w, h))`` -> (document after its scripts ran, console messages).
 
-    Skips where no Chromium is installed (Debian: apt-get install chromium); this is the only place that does.
+    Skips where no Chromium is installed (Debian: apt-get install chromium).
     """
-    program = next((path for path in map(shutil.which, _NAMES) if path), None)
+    program = find_browser()
     if program is None:
         pytest.skip("no Chromium found")
     profile = tmp_path_factory.mktemp("chromium")

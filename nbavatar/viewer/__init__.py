@@ -1,0 +1,1 @@
+"""A viewer in the browser: pictures of trained avatars, made on request by one thread, shown by viser."""
