@@ -80,7 +80,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv is None and verb in _WITH_TORCH and SOCKET_VARIABLE in os.environ:
         from nbavatar.cli.warm import call
 
-        return call(arguments)
+        code = call(arguments)
+        if code is not None:
+            return code
     try:
         module = importlib.import_module(f"nbavatar.cli.{verb.replace('-', '_')}")
         own = argparse.ArgumentParser(

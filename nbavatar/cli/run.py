@@ -17,7 +17,6 @@ import argparse
 import importlib.util
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import Any
 from nbavatar.cli.run_words import check_files, profile_files, read_words
 from nbavatar.cli.supervision import run_workflow, wait
 from nbavatar.errors import DataError, DependencyError
+from nbavatar.io.atomic import atomic_write
 from nbavatar.packages import install_line
 
 __all__ = ["add_arguments", "copy_configuration", "main", "pipeline_folder"]
@@ -149,9 +149,7 @@ def copy_configuration(source: Path, here: Path) -> list[Path]:
         name = path.relative_to(source)
         if not path.is_file() or (here / name).exists() or (here / name).is_symlink():
             continue
-        (here / name).parent.mkdir(parents=True, exist_ok=True)
-        part = here / name.with_name(f".{name.name}.part")
-        shutil.copyfile(path, part)
-        part.replace(here / name)
+        with atomic_write(here / name) as temporary, open(temporary, "xb") as stream:  # never through a link
+            stream.write(path.read_bytes())
         written.append(name)
     return written

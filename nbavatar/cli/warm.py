@@ -24,6 +24,8 @@ import selectors
 import shutil
 import signal
 import socket
+import stat
+import struct
 import subprocess
 import sys
 import tempfile
@@ -50,13 +52,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("command", nargs=argparse.REMAINDER, metavar="-- COMMAND ...", help="what to run")
 
 
-def call(argv: Sequence[str]) -> int:
-    """Has the server run `nbavatar <argv>`; returns its exit code."""
+def call(argv: Sequence[str]) -> int | None:
+    """Has the server run `nbavatar <argv>`; returns its exit code, or None where no server of this user is there.
+
+    Environments outlive servers: in sessions that were begun below one, in jobs that a cluster runs elsewhere. What
+    then listens under the old name may be anybody's, and would be given this process's environment and open files.
+    """
     request = json.dumps({"argv": list(argv), "folder": os.getcwd(), "environment": dict(os.environ)}).encode()
     with socket.socket(socket.AF_UNIX) as connection:
-        answer = b""
-        with contextlib.suppress(ConnectionError, FileNotFoundError):
+        try:
+            if not _ours(Path(os.environ[SOCKET_VARIABLE]).parent):
+                return None
             connection.connect(os.environ[SOCKET_VARIABLE])
+        except OSError:
+            return None
+        if not _same_user(connection):
+            return None
+        answer = b""
+        with contextlib.suppress(ConnectionError):
             socket.send_fds(connection, [len(request).to_bytes(8, "big")], [0, 1, 2])
             connection.sendall(request)
             # If this process is ended, the server sees the connection close, and ends the job.
@@ -65,6 +78,20 @@ def call(argv: Sequence[str]) -> int:
         print("nbavatar: error: the process of `nbavatar warm` is gone", file=sys.stderr)
         return 1
     return answer[0]
+
+
+def _ours(folder: Path) -> bool:
+    """Whether a folder is as the server makes it: this user's, and closed to all others."""
+    info = os.lstat(folder)
+    return stat.S_ISDIR(info.st_mode) and info.st_uid == os.geteuid() and not info.st_mode & 0o077
+
+
+def _same_user(connection: socket.socket) -> bool:
+    """Whether a process of this user listens at the other end, where the system tells (Linux)."""
+    if not hasattr(socket, "SO_PEERCRED"):
+        return True
+    _, user, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    return user == os.geteuid()
 
 
 def main(args: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 from nbavatar.errors import NBAvatarError, StorageError
 from nbavatar.processes import alive, machine
 
-__all__ = ["atomic_write", "storage_errors", "temporary_beside"]
+__all__ = ["atomic_write", "no_links", "storage_errors", "temporary_beside"]
 
 _ABANDONED_S = 24 * 3600.0  # a temporary file that nothing was written to for so long has no writer
 _LONG_NAME = 200  # bytes
@@ -58,6 +58,15 @@ def temporary_beside(path: str | os.PathLike[str]) -> Path:
         stem, suffix = hashlib.sha256(stem.encode()).hexdigest()[:32], suffix[-_LONG_NAME // 2 :]
     _sweep(target.parent, stem, suffix)
     return target.with_name(f".{stem}.{machine()}-{os.getpid()}.{secrets.token_hex(4)}.tmp{suffix}")
+
+
+def no_links(path: str, flags: int) -> int:
+    """Opener for files that are appended to or written in place: what a folder from elsewhere links to is not ours.
+
+    Raises:
+        OSError: as `os.open`; ELOOP where the file is a link.
+    """
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 @contextlib.contextmanager

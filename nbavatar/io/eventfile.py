@@ -20,7 +20,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from nbavatar.io.atomic import storage_errors
+from nbavatar.io.atomic import no_links, storage_errors
 
 __all__ = ["EventFile", "crc32c"]
 
@@ -78,7 +78,7 @@ class EventFile:
 
     def _write(self, data: bytes) -> None:
         length = struct.pack("<Q", len(data))
-        with storage_errors(self.path), open(self.path, "ab") as stream:
+        with storage_errors(self.path), open(self.path, "ab", opener=no_links) as stream:
             stream.write(length + _masked(length) + data + _masked(data))
 
 

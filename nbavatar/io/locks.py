@@ -15,6 +15,7 @@ import weakref
 from pathlib import Path
 
 from nbavatar.errors import DataError
+from nbavatar.io.atomic import no_links
 from nbavatar.processes import alive, machine
 
 __all__ = ["Hold", "hold"]
@@ -41,7 +42,7 @@ def hold(path: str | os.PathLike[str], purpose: str) -> Hold:
         DataError: another process holds it.
         OSError: the file cannot be opened.
     """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    descriptor = no_links(os.fspath(path), os.O_RDWR | os.O_CREAT)
     lock = Hold(descriptor)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -61,14 +62,19 @@ def _hold_by_number(path: Path, purpose: str, lock: Hold) -> None:
     if where and where != machine():
         _LOG.warning("%s: this disk has no locks; process %s of another machine is taken to have ended", path, number)
     own = f"{machine()} {os.getpid()}"
-    path.write_text(own, encoding="utf-8")
+    _write(path, own)
     weakref.finalize(lock, _forget, path, own)
 
 
 def _forget(path: Path, own: str) -> None:
     with contextlib.suppress(OSError):
         if path.read_text(encoding="utf-8", errors="replace") == own:
-            path.write_text("", encoding="utf-8")
+            _write(path, "")
+
+
+def _write(path: Path, text: str) -> None:
+    with open(path, "w", encoding="utf-8", opener=no_links) as stream:
+        stream.write(text)
 
 
 def _held(path: str | os.PathLike[str], found: str) -> DataError:

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from nbavatar.errors import parsing
-from nbavatar.io.atomic import atomic_write, storage_errors
+from nbavatar.io.atomic import atomic_write, no_links, storage_errors
 from nbavatar.io.eventfile import EventFile
 from nbavatar.io.images import encode_png
 from nbavatar.io.locks import Hold, hold
@@ -100,7 +100,7 @@ class RunFolder:
     def log(self, event: Mapping[str, Any]) -> None:
         """Append one line to the events, and its numbers to the curves."""
         file = self.path / "events.jsonl"
-        with storage_errors(file), open(file, "a", encoding="utf-8") as stream:
+        with storage_errors(file), open(file, "a", encoding="utf-8", opener=no_links) as stream:
             stream.write(canonical_json(dict(event)) + "\n")
         numbers = {f"train/{name}": value for name, value in event.items() if name != "step" and value is not None}
         self._event_file().scalars(event["step"], numbers)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from nbavatar.config.tradeoff import SettingConfig, TradeoffConfig, vary
-from nbavatar.io.atomic import storage_errors
+from nbavatar.io.atomic import no_links, storage_errors
 from nbavatar.studies.tradeoff.front import Point, choose_preset, within
 
 __all__ = ["PointLog", "first_settings", "knob_of", "run_sweep"]
@@ -40,7 +40,7 @@ class PointLog:
         content = self._path.read_bytes() if self._path.is_file() else b""
         whole = content[: content.rfind(b"\n") + 1]
         if whole != content:
-            with open(self._path, "r+b") as stream:
+            with open(self._path, "r+b", opener=no_links) as stream:
                 stream.truncate(len(whole))
         for line in whole.splitlines():
             try:
@@ -56,7 +56,7 @@ class PointLog:
     def add(self, entry: dict[str, Any]) -> None:
         """Appends a line; it is on disk when this returns."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        with storage_errors(self._path), open(self._path, "a", encoding="utf-8") as stream:
+        with storage_errors(self._path), open(self._path, "a", encoding="utf-8", opener=no_links) as stream:
             stream.write(json.dumps(entry, sort_keys=True) + "\n")
             stream.flush()
             os.fsync(stream.fileno())

@@ -190,3 +190,15 @@ def test_a_profile_takes_the_place_of_the_warm_run(calls, tmp_path, monkeypatch,
     assert own[0] != "warm" and own[-4:-2] == ["--workflow-profile", "slurm"]
     assert main(["run", "smoke", "--profile", "slrum"]) == 2
     assert "slrum: expected a folder with a profile.yaml in it, or one of ci, " in capsys.readouterr().err
+
+
+def test_configuration_is_not_written_through_a_link_that_waits_for_it(tmp_path):
+    """As a shared folder, or an archive, may have it."""
+    notes = tmp_path / "notes"
+    notes.write_text("mine")
+    (tmp_path / "here" / "config").mkdir(parents=True)
+    for name in (".smoke.yaml.part", ".smoke.yaml"):
+        (tmp_path / "here" / "config" / name).symlink_to(notes)
+    run.copy_configuration(ROOT, tmp_path / "here")
+    assert notes.read_text() == "mine"
+    assert not (tmp_path / "here/config/smoke.yaml").is_symlink()

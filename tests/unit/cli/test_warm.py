@@ -2,6 +2,8 @@
 
 import json
 import os
+import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -9,6 +11,10 @@ import time
 from pathlib import Path
 
 import psutil
+import pytest
+
+from nbavatar.cli import SOCKET_VARIABLE, warm
+from tests.unit.users import OTHER
 
 # The command that runs under the server; one for all checks, because starting the server loads torch.
 _SCRIPT = """
@@ -180,3 +186,37 @@ def test_without_a_folder_for_a_socket_jobs_still_run(tmp_path, monkeypatch, cap
     done = subprocess.run([sys.executable, "-c", nowhere], capture_output=True, text=True)
     assert done.returncode == 4
     assert "no folder for a socket" in done.stderr and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("owner", ["of the folder", "of the socket"])
+def test_a_server_of_another_user_is_given_nothing(public_folder, monkeypatch, owner):
+    """The name was free again, and is in the environment still: of a session, or of a job that a cluster runs."""
+    folder = public_folder / "nbavatar-warm"
+    folder.mkdir(mode=0o700)
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(folder / "socket"))
+    if owner == "of the folder":
+        os.chown(folder, OTHER, OTHER)
+    reading, writing = os.pipe()
+    other = os.fork()
+    if other == 0:
+        os.setuid(OTHER)
+        listener.listen()
+        os.write(writing, b".")
+        connection, _ = listener.accept()
+        os.write(writing, connection.recv(1000))
+        os._exit(0)
+    assert os.read(reading, 1) == b"."
+    os.close(writing)
+    monkeypatch.setenv(SOCKET_VARIABLE, str(folder / "socket"))
+    try:
+        assert warm.call(["train"]) is None  # and runs by itself
+    finally:
+        os.kill(other, signal.SIGKILL)
+        os.waitpid(other, 0)
+    assert os.read(reading, 1000) == b""
+
+
+def test_without_the_server_a_job_runs_by_itself(tmp_path, monkeypatch):
+    monkeypatch.setenv(SOCKET_VARIABLE, str(tmp_path / "gone" / "socket"))
+    assert warm.call(["train"]) is None

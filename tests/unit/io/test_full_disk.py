@@ -1,6 +1,7 @@
 """No room: every kind of file ends in one line with its path, nothing under its name but what was there before."""
 
 import errno
+import fcntl
 import gc
 import os
 import resource
@@ -263,3 +264,23 @@ def test_the_longest_name_that_a_disk_takes(tmp_path):
     path = tmp_path / ("ü" * 125 + ".json")  # 255 bytes
     write_json(path, {"x": 1})
     assert read_json(path) == {"x": 1}
+
+
+@pytest.mark.parametrize("name", ["events.jsonl", "lock"])
+@pytest.mark.parametrize("locks", [True, False])
+def test_what_a_state_from_elsewhere_links_to_is_not_written(tmp_path, monkeypatch, name, locks):
+    def no_lock(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "")
+
+    if not locks:  # as on some network disks, where the file itself says who holds it
+        monkeypatch.setattr(fcntl, "flock", no_lock)
+    notes = tmp_path / "notes"
+    notes.write_text('{"step": 1}\n')
+    state = tmp_path / "m.pt.state"
+    RunFolder(state, {})
+    gc.collect()
+    (state / name).unlink(missing_ok=True)
+    (state / name).symlink_to(notes)
+    with pytest.raises(OSError, match="symbolic links"):
+        RunFolder(state, {}).log({"step": 2, "loss": 0.5})
+    assert notes.read_text() == '{"step": 1}\n'
