@@ -25,6 +25,7 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from nbavatar.cli.common import add_cfg_argument, stage_config
 from nbavatar.cli.results import read_evaluation, read_histories, read_sweep, read_timing
@@ -234,6 +235,11 @@ def _picture(name: str, cfg: ReportConfig) -> tuple[str, str, str]:
     return title, _embedded(path, cfg), text
 
 
+def beside(path: Path, page_path: Path) -> str:
+    """Address of a file relative to a page. A folder's name could be read as a scheme, or end the path by a # or ?."""
+    return "./" + quote(os.fsencode(os.path.relpath(path, page_path.parent).replace(os.sep, "/")))
+
+
 def _video(name: str, page_path: str, cfg: ReportConfig) -> tuple[str, str, bool]:
     """Title, address, and whether the address holds the video itself (or leads to the file)."""
     path = Path(name)
@@ -243,5 +249,5 @@ def _video(name: str, page_path: str, cfg: ReportConfig) -> tuple[str, str, bool
     except FileNotFoundError as error:
         raise DataError.of(name, expected="a video (.mp4)", found="no such file") from error
     if size > cfg.video_mb * 1e6:
-        return title, os.path.relpath(path, Path(page_path).parent).replace(os.sep, "/"), False
+        return title, beside(path, Path(page_path)), False
     return title, "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode("ascii"), True

@@ -7,6 +7,7 @@ from typing import Any
 from nbavatar.errors import DataError, parsing
 from nbavatar.io.forms import check_form
 from nbavatar.io.records import read_json, read_record
+from nbavatar.names import check_name
 
 __all__ = ["read_evaluation", "read_histories", "read_result", "read_sweep", "read_timing"]
 
@@ -86,7 +87,7 @@ def read_evaluation(path: str) -> dict[str, Any]:
     Raises:
         DataError: missing, or of another form.
     """
-    return read_record(path, _EVALUATION)
+    return _named(read_record(path, _EVALUATION), path)
 
 
 def read_timing(path: str) -> dict[str, Any]:
@@ -108,7 +109,18 @@ def read_result(path: str) -> dict[str, Any]:
     if not isinstance(content, dict) or not {"metrics", "speed"} & set(content):
         raise DataError.of(path, expected="a result of nbavatar evaluate or speed", found="another JSON file")
     check_form(content, _CAPTIONED if "metrics" in content else _TIMING, path)
-    return content
+    return _named(content, path) if "metrics" in content else content
+
+
+def _named(evaluation: dict[str, Any], path: object) -> dict[str, Any]:
+    """The same evaluation, if the names in it are names: they become parts of tables, pages and LaTeX."""
+    for field, name in (
+        ("subject", evaluation["subject"]),
+        ("variant", evaluation["variant"]),
+        ("protocol.name", evaluation["protocol"]["name"]),
+    ):
+        check_name(name, path, field, error=DataError)
+    return evaluation
 
 
 def read_sweep(path: Path) -> tuple[str, dict[str, Any]]:

@@ -2,16 +2,28 @@
 
 import dataclasses
 import os
+import re
 
 from nbavatar.config.core import option
 from nbavatar.config.layouts import choose_layout, read_layouts
-from nbavatar.errors import ConfigError
+from nbavatar.errors import ConfigError, describe
 
 __all__ = ["TIMED", "TRAINED", "Panel", "TableLayout", "TableRow", "choose_table", "read_tables"]
 
 # Columns that come from a timing, and from the record of a training.
 TIMED = ("fps", "ms", "memory_mb")
 TRAINED = ("model_mb", "primitives", "train_minutes", "train_memory_mb")
+_LABEL = re.compile(r"[A-Za-z0-9:._-]*")
+# What may stand between the $ signs of a row: nothing that reads a file, defines, or ends the formula.
+_FORMULA = re.compile(r"(?:\\[A-Za-z]++|\\[,;! ]|\^(?!\^)|[A-Za-z0-9 _{}+\-=.,:;()\[\]|/<>*'!])*")
+_COMMANDS = frozenset(
+    "alpha beta gamma delta epsilon varepsilon zeta eta theta kappa lambda mu nu xi pi rho sigma tau phi varphi "
+    "chi psi omega Gamma Delta Theta Lambda Xi Pi Sigma Phi Psi Omega mathcal mathbf mathrm mathit mathbb mathsf "
+    "mathtt text textbf textit textrm boldsymbol bm hat bar tilde vec dot overline underline times cdot pm mp leq "
+    "geq neq approx sim ll gg infty ldots cdots to rightarrow leftarrow uparrow downarrow in ell partial nabla "
+    "sum prod frac sqrt log exp min max left right quad qquad ast star circ prime dagger emptyset setminus cup "
+    "cap".split()
+)
 METRICS = ("psnr", "ssim", "lpips", "psnr_fg", "ssim_fg", *TIMED, *TRAINED, "train_cameras", "test_camera")
 
 
@@ -94,9 +106,23 @@ def read_tables(path: str | os.PathLike[str]) -> dict[str, TableLayout]:
         where = f"{path}: {name}"
         if not table.rows or not table.panels or not table.columns:
             raise ConfigError.of(where, expected="rows, columns and panels", found="an empty list among them")
+        if not _LABEL.fullmatch(table.label):
+            expected = "letters, digits, ':', '.', '_' and '-'"
+            raise ConfigError.of(where, "label", expected=expected, found=describe(table.label))
+        for row in table.rows:
+            _check_formulas(row.label, where)
         if table.kind in ("subjects", "mean", "subject") and not table.subjects:
             raise ConfigError.of(where, "subjects", expected="one subject or more", found="none")
     return tables
+
+
+def _check_formulas(label: str, where: str) -> None:
+    """Refuses a label whose formulas are more than formulas: what is between its $ signs goes to LaTeX as it is."""
+    for formula in label.split("$")[1::2]:
+        unknown = [name for name in re.findall(r"\\([A-Za-z]+)", formula) if name not in _COMMANDS]
+        if unknown or not _FORMULA.fullmatch(formula):
+            found = f"\\{unknown[0]}" if unknown else describe(formula)
+            raise ConfigError.of(where, "label of a row", expected="a plain formula between $ signs", found=found)
 
 
 def choose_table(tables: dict[str, TableLayout], name: str, where: str) -> TableLayout:

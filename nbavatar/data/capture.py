@@ -13,6 +13,7 @@ Lengths are metres, world axes any, pixel centres at +0.5. Every reader raises `
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -255,9 +256,9 @@ def _ids(stored: Mapping[str, Any], key: str, path: Path) -> list[str]:
     if not isinstance(values, list) or not all(isinstance(v, (str, int)) for v in values):
         raise DataError.of(path, key, expected="a list of frame ids", found=repr(values)[:60])
     ids = [str(v) for v in values]
-    twice = [v for i, v in enumerate(ids) if v in ids[:i]] if len(set(ids)) != len(ids) else []
-    if twice:
-        raise DataError.of(path, key, expected="each frame once", found=f"'{twice[0]}' twice")
+    if len(set(ids)) != len(ids):
+        twice = next(v for v, count in Counter(ids).items() if count > 1)
+        raise DataError.of(path, key, expected="each frame once", found=f"'{twice}' twice")
     return [check_name(frame, path, key, error=DataError) for frame in ids]
 
 

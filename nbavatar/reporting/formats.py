@@ -85,7 +85,7 @@ def to_markdown(table: Table) -> str:
                 parts.append(_md_row([plain(line.label), *(_md_cell(cell) for cell in cells)]))
         parts.append("")
     parts += [*(f"- {note}" for note in table.notes), ""]
-    sources = [f"- `{path}` {digest}" for path, digest in _sources(table)]
+    sources = [f"- `{_one_line(path)}` {digest}" for path, digest in _sources(table)]
     if sources:
         parts += ["Sources:", "", *sources, ""]
     if table.record:
@@ -107,7 +107,7 @@ def to_latex(table: Table) -> str:
     notes = " ".join([table.caption, *table.notes])
     parts = [
         f"% Table {table.name}. Needs \\usepackage{{booktabs,graphicx,subcaption}} and \\usepackage[table]{{xcolor}}.",
-        *(f"% source: {path} {digest}" for path, digest in _sources(table)),
+        *(f"% source: {_one_line(path)} {digest}" for path, digest in _sources(table)),
         *([f"% record: {json.dumps(table.record, sort_keys=True)}"] if table.record else []),
         "\\begin{table}[t]",
         "\\centering",
@@ -182,6 +182,11 @@ def _latex_heading(column: str) -> str:
 
 def _escape(text: str) -> str:
     return "".join(_SPECIAL.get(letter, letter) for letter in text)
+
+
+def _one_line(path: str) -> str:
+    """A path with its line breaks and other control characters written out: behind one, a comment would have ended."""
+    return json.dumps(path, ensure_ascii=False)[1:-1]
 
 
 def _heading(group: str, column: str) -> str:

@@ -92,6 +92,8 @@ def test_cuts_divide_runs(capture):
         (lambda s: s.update(train=["t1"], test=["t1"]), "'t1', which is in both"),
         (lambda s: s.update(frames=[]), "at least one frame id"),
         (lambda s: s.update(frames=["t1", "t1"]), "each frame once"),
+        # Minutes, where every frame was looked for in all before it.
+        (lambda s: s.update(frames=[f"t{i}" for i in range(200_000)] + ["t7"]), "each frame once, found 't7' twice"),
         (lambda s: s.update(frames=["../t1"]), "a name of letters"),
         (lambda s: s.update(cuts=["t1"]), "pairs of frame ids"),
         (lambda s: s.update(cuts=[["1", "2"]]), "cuts: expected pairs of ids that are in frames, found '1'"),

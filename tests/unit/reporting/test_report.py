@@ -4,11 +4,13 @@ import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote, urljoin, urlsplit
 
 import numpy as np
 import pytest
 
 from nbavatar.cli import main
+from nbavatar.cli.report import beside
 from nbavatar.io.framepack import FramePackWriter
 from nbavatar.io.images import encode_png
 from nbavatar.reporting.comparison import find_truth
@@ -195,7 +197,15 @@ def test_quality_against_cost_figures_and_videos(run):
     assert "Novel views. As &lt;seen&gt;" in text and "S2 102/0000" in text
     assert 'src="data:video/mp4;base64,' in text
     linked = build(folder, options, "--cfg", '{"video_mb": 0}')
-    assert '<a href="turntable.mp4">' in linked and "<video" not in linked
+    assert '<a href="./turntable.mp4">' in linked and "<video" not in linked
+
+
+def test_a_link_to_a_video_is_one_whatever_its_folder_is_called():
+    folder = "javascript:alert(1)#a?b%"
+    page_path, video = Path("page.html"), Path(folder, "x.mp4")
+    address = urlsplit(urljoin("file:///here/page.html", beside(video, page_path)))
+    assert (address.scheme, unquote(address.path)) == ("file", f"/here/{folder}/x.mp4")
+    assert (address.query, address.fragment) == ("", "")
 
 
 def test_same_files_give_the_same_page(run):

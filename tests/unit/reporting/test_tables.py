@@ -328,3 +328,45 @@ def test_tables_start_without_torch():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout.strip() == "[]"
+
+
+HARMLESS = r"w/o $\mathcal{L}_{NB}^{2} \times 3$, 5% & more"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("label", r"x}\input{/etc/passwd}\label{y", "expected letters, digits"),
+        ("row", r"$\input{/etc/passwd}$", r"a plain formula between \$ signs, found \\input"),
+        ("row", r"a $x$ and $\csname input\endcsname{/etc/passwd}$", r"found \\csname"),
+        ("row", "$^^5cinput{/etc/passwd}$", "a plain formula"),
+        ("row", "$x$ $%\n$", "a plain formula"),
+        ("row", HARMLESS, ""),
+    ],
+)
+def test_a_layout_brings_no_commands_into_latex(tmp_path, capsys, key, value, message):
+    row = {"label": value if key == "row" else "Ours", "variant": "full"}
+    panel = {"protocol": "nv1024"}
+    table = {"kind": "mean", "title": "T", "label": value if key == "label" else "t", "subjects": ["S2"],
+             "columns": ["psnr"], "panels": [panel], "rows": [row]}  # fmt: skip
+    (tmp_path / "t.yaml").write_text(json.dumps({"one": table}))
+    words = ["table", "--table", "one", "--layout", str(tmp_path / "t.yaml"), "--reported", REPORTED]
+    code = main([*words, "--evals", "--speeds", "--out-stem", str(tmp_path / "one")])
+    assert code == (2 if message else 0)
+    if message:
+        assert re.search(message, capsys.readouterr().err)
+    else:
+        assert r"w/o $\mathcal{L}_{NB}^{2} \times 3$, 5\% \& more" in (tmp_path / "one.tex").read_text()
+
+
+def test_results_bring_no_commands_into_latex(tmp_path, capsys):
+    evil = evaluation(tmp_path, "S2", "full", "nv1024", 1024)
+    named = tmp_path / "e\n\\immediate\\write18{id}\n.json"
+    Path(evil).rename(named)
+    _, markdown, latex = make(tmp_path, "novel_view_1024", [str(named)])
+    assert not any(line.startswith("\\immediate") for text in (markdown, latex) for line in text.splitlines())
+    content = json.loads(named.read_text()) | {"subject": r"$\input{/etc/passwd}$"}
+    named.write_text(json.dumps(content))
+    code = main(["table", "--table", "novel_view_1024", "--layout", LAYOUT, "--reported", REPORTED,
+                 "--evals", str(named), "--speeds", "--out-stem", str(tmp_path / "o")])  # fmt: skip
+    assert code == 2 and "subject: expected a name" in capsys.readouterr().err
