@@ -14,9 +14,10 @@ import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-__all__ = ["PACKAGE", "ROOT", "dependencies", "imports_of", "is_neutral", "source_of"]
+__all__ = ["PACKAGE", "REGISTRY", "ROOT", "dependencies", "imports_of", "is_neutral", "kinds_of", "source_of"]
 
 PACKAGE = "nbavatar"
+REGISTRY = "nbavatar.methods.registry"
 ROOT = Path(__file__).resolve().parent
 
 _MARK = r"#[ \t]*provenance:[ \t]*neutral\b"
@@ -67,6 +68,12 @@ def imports_of(module: str) -> frozenset[str]:
             names.update(_DOTTED.findall(found[1].partition("#")[0]))
     names.update(_QUOTED.findall(text))
     return frozenset(name for name in names if name != module and source_of(name) is not None)
+
+
+@functools.cache
+def kinds_of(module: str) -> tuple[str, ...]:
+    """Which classes of methods a module asks the registry for: `avatar`, `training`, `options`."""
+    return tuple(kind for kind in ("avatar", "training", "options") if f"{kind}_class" in _text(module))
 
 
 def dependencies(

@@ -16,7 +16,7 @@ from importlib import metadata
 from typing import Any
 
 from nbavatar import __version__
-from nbavatar.imports import PACKAGE, ROOT, dependencies, imports_of
+from nbavatar.imports import PACKAGE, REGISTRY, ROOT, dependencies, imports_of, kinds_of
 from nbavatar.methods.registry import METHODS
 from nbavatar.syntax import syntax_digests
 
@@ -34,33 +34,32 @@ def file_digest(path: str | os.PathLike[str]) -> str:
 
 
 @functools.cache
-def code_modules(verb: str, method: str | None = None) -> tuple[str, ...]:
+def code_modules(verb: str, methods: tuple[str, ...] | None = None) -> tuple[str, ...]:
     """Names of all modules of this package that `nbavatar <verb>` can import, sorted.
 
     Args:
         verb: the command.
-        method: the only method (`nbavatar.methods.registry`) whose avatars it meets; None for any.
+        methods: whose avatars it can meet (`nbavatar.methods.registry`); None for any.
     """
 
     def follow(module: str) -> set[str]:
         names = set(imports_of(module))
-        if f"{PACKAGE}.methods.registry" in names:
-            for name, entry in METHODS.items():
-                if method in (None, name):
-                    names.update(place.partition(":")[0] for place in entry.places())
+        if REGISTRY in names:
+            entries = [METHODS[name] for name in (METHODS if methods is None else methods)]
+            names |= {getattr(entry, kind).partition(":")[0] for kind in kinds_of(module) for entry in entries}
         return names
 
     return dependencies([f"{PACKAGE}.cli.{verb.replace('-', '_')}"], follow=follow)
 
 
 @functools.cache
-def code_digest(verb: str, method: str | None = None) -> str:
+def code_digest(verb: str, methods: tuple[str, ...] | None = None) -> str:
     """Digest (12 hex digits) of the code behind `nbavatar <verb>`, blind to comments, docstrings and layout.
 
     Arguments as in `code_modules`.
     """
     total = hashlib.sha256()
-    for module, digest in syntax_digests(code_modules(verb, method)).items():
+    for module, digest in syntax_digests(code_modules(verb, methods)).items():
         total.update(f"{module}\0{digest}\0".encode())
     return total.hexdigest()[:12]
 
@@ -72,6 +71,7 @@ def run_record(
     inputs: Mapping[str, str | os.PathLike[str]],
     device: str = "cpu",
     seed: int | None = None,
+    methods: tuple[str, ...] | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The block that every result carries.
@@ -82,12 +82,13 @@ def run_record(
         inputs: short name -> file; each is digested.
         device: device that computed, such as `cpu` or a GPU's name.
         seed: seed of all random numbers, if there were any.
+        methods: of the avatars that it met; None for any.
         extra: further keys of this command (subject, variant, ...).
     """
     return {
         "command": command,
         "config": dict(config),
-        "code": code_digest(command),
+        "code": code_digest(command, methods),
         "inputs": {name: file_digest(path) for name, path in sorted(inputs.items())},
         "versions": _versions(),
         "device": device,

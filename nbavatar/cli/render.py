@@ -62,6 +62,7 @@ def _render(args: argparse.Namespace, protocol: ProtocolConfig, device: str) -> 
     from nbavatar.methods.storage import load_avatar
 
     avatar = load_avatar(args.model, device)
+    methods = (avatar.method,)
     sequence, _ = read_sequence(args.meshes)
     packs = [FramePack(path) for path in args.frames]
     chosen = [
@@ -98,6 +99,7 @@ def _render(args: argparse.Namespace, protocol: ProtocolConfig, device: str) -> 
             config=to_mapping(protocol),
             inputs=inputs,
             device=device_name(device),
+            methods=methods,
             extra={"training": {"config": avatar.record.get("config"), "code": avatar.record.get("code"), **trained}}
             | ({"tuned": tuned} if tuned else {}),
         ),

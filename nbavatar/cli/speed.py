@@ -18,8 +18,8 @@ import os
 
 from nbavatar.cli.common import add_cfg_argument, stage_config
 from nbavatar.cli.settings import add_preset_arguments, tuned_avatar
-from nbavatar.config.avatar import SpeedConfig
 from nbavatar.config.core import to_mapping
+from nbavatar.config.evaluation import SpeedConfig
 from nbavatar.devices import device_name, lease_device
 from nbavatar.io.records import write_json
 from nbavatar.provenance import run_record
@@ -50,6 +50,7 @@ def main(args: argparse.Namespace) -> int:
         from nbavatar.methods.storage import load_avatar
 
         avatar = load_avatar(args.model, device)
+        methods = (avatar.method,)
         sequence, _ = read_sequence(args.meshes)
         packs = [FramePack(path) for path in args.frames]
         wanted = max(1, config.frames // len(packs))
@@ -66,7 +67,9 @@ def main(args: argparse.Namespace) -> int:
         if tuned:
             result["tuned"] = tuned
         inputs = {"model": args.model, "meshes": args.meshes} | {f"frames.{i}": p for i, p in enumerate(args.frames)}
-        record = run_record("speed", config=to_mapping(config), inputs=inputs, device=device_name(device))
+        record = run_record(
+            "speed", config=to_mapping(config), inputs=inputs, device=device_name(device), methods=methods
+        )
     write_json(args.out, record | {"speed": result})
     totals = ", ".join(f"{name} {value:.1f} FPS" for name, value in result["fps"].items())
     what = f"{width}x{height}, {result['primitives']} primitives, raster {result['ms']['raster']:.2f} ms"

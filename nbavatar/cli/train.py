@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from nbavatar.cli.common import add_cfg_argument, stage_config
-from nbavatar.config.avatar import TrainConfig
-from nbavatar.config.core import from_mapping, to_mapping
+from nbavatar.config.core import from_mapping, merge, to_mapping
+from nbavatar.config.training import TrainConfig, own_options
 from nbavatar.devices import device_name, lease_device, peak_memory_mb
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.arrays import read_arrays
@@ -63,7 +63,12 @@ def main(args: argparse.Namespace) -> int:
             raise DataError.of(path, expected=f"a file (--{name.partition('.')[0]})", found="no such file")
     with lease_device(args.device) as device:
         record = run_record(
-            "train", config=to_mapping(config), inputs=inputs, device=device_name(device), seed=config.seed
+            "train",
+            config=own_options(to_mapping(config)),
+            inputs=inputs,
+            device=device_name(device),
+            seed=config.seed,
+            methods=(config.method,),
         )
         summary = _train(args, config, record, device)
     if not summary["finished"]:
@@ -91,8 +96,8 @@ def _with_preset(name: str, path: str | None, cfg: TrainConfig) -> TrainConfig:
         raise ConfigError.of("--presets", expected="a file, there is no model yet to look beside", found="none")
     setting = preset_setting(path, name, model=None, device="").setting
     taken = {key: getattr(setting, key) for key in ("order", "precision", "roi", "roi_margin")}
-    options = to_mapping(cfg) | {key: value for key, value in taken.items() if value is not None}
-    return from_mapping(type(cfg), options, f"--preset {name}")
+    options = {cfg.method: {key: value for key, value in taken.items() if value is not None}}
+    return from_mapping(type(cfg), merge(to_mapping(cfg), options), f"--preset {name}")
 
 
 def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any], device: str) -> dict[str, Any]:
@@ -103,7 +108,7 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     from nbavatar.data.sequences import read_sequence
     from nbavatar.data.views import ViewStore, check_views, views_of
     from nbavatar.io.framepack import FramePack
-    from nbavatar.methods.base import create_method
+    from nbavatar.methods.create import create_method
     from nbavatar.methods.storage import save_avatar
     from nbavatar.training.loop import train
     from nbavatar.training.state import RunFolder

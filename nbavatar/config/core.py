@@ -57,7 +57,9 @@ def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
     values: dict[str, Any] = {}
     for key, value in mapping.items():
         if key not in fields:
-            raise ConfigError(f"{where}: unknown key '{key}'; {did_you_mean(str(key), fields)}")
+            blocks = [name for name, hint in hints.items() if dataclasses.is_dataclass(hint) and _has(hint, key)]
+            meant = f"write {blocks[0]}: {{{key}: ...}}" if blocks else did_you_mean(str(key), fields)
+            raise ConfigError(f"{where}: unknown key '{key}'; {meant}")
         values[key] = _read(hints[key], value, fields[key].metadata, f"{where}.{key}")
     try:
         return cls(**values)
@@ -105,6 +107,10 @@ def json_schema(cls: type) -> dict[str, Any]:
     if required:
         result["required"] = required
     return result
+
+
+def _has(cls: Any, key: Any) -> bool:
+    return key in {field.name for field in dataclasses.fields(cls)}
 
 
 def _has_no_default(field: "dataclasses.Field[Any]") -> bool:

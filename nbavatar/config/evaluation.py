@@ -10,8 +10,20 @@ from dataclasses import dataclass
 
 from nbavatar.config.core import option, to_mapping
 
-__all__ = ["PROTOCOLS", "EvaluateConfig", "ProtocolConfig", "ReportConfig", "TableConfig", "VideoConfig"]
+__all__ = ["PROTOCOLS", "EvaluateConfig", "ProtocolConfig", "ReportConfig", "SpeedConfig", "TableConfig", "VideoConfig"]
 __all__ += ["protocol_hash"]
+
+
+@dataclass(frozen=True)
+class SpeedConfig:
+    """Timing of a trained avatar."""
+
+    frames: int = option(8, "Different frames that are timed.", min=1)
+    repeats: int = option(20, "Timed passes over each stage.", min=1)
+    warmup: int = option(3, "Passes before timing starts.", min=0)
+    precisions: list[str] = option(
+        ["fp32", "bf16"], "Arithmetics of the U-Net to time.", choices=("fp32", "bf16", "fp16")
+    )
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,19 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from nbavatar.config.avatar import SpeedConfig, TrainConfig
 from nbavatar.config.core import from_mapping, merge, option, to_mapping
-from nbavatar.config.evaluation import EvaluateConfig, ProtocolConfig, ReportConfig, TableConfig, VideoConfig
+from nbavatar.config.evaluation import (
+    EvaluateConfig,
+    ProtocolConfig,
+    ReportConfig,
+    SpeedConfig,
+    TableConfig,
+    VideoConfig,
+)
 from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, SpectralConfig
 from nbavatar.config.preprocess import CheckConfig, CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
+from nbavatar.config.training import TrainConfig, own_options
 from nbavatar.config.yamlfiles import check_tree
 from nbavatar.errors import ConfigError, describe, did_you_mean
 from nbavatar.names import check_name, check_place
@@ -155,8 +162,9 @@ def load_run(mapping: Mapping[str, Any], where: str = "config") -> RunConfig:
 
 
 def stage_options(run: RunConfig, stage: str, variant: str | None = None) -> dict[str, Any]:
-    """The resolved options of one stage, all keys present, JSON-ready."""
-    return to_mapping(_resolved(run, stage, variant))
+    """The resolved options of one stage, all keys present, JSON-ready; of training, those of its method."""
+    options = to_mapping(_resolved(run, stage, variant))
+    return own_options(options) if stage == "train" else options
 
 
 def _resolved(run: RunConfig, stage: str, variant: str | None) -> Any:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nbavatar.config.avatar import SpeedConfig
+from nbavatar.config.evaluation import SpeedConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
 from nbavatar.devices import peak_memory_mb

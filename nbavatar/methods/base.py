@@ -14,15 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
 from nbavatar.errors import ConfigError, DataError
-from nbavatar.methods.registry import METHODS, resolve
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import Plan, plan_at, total_steps
 
-__all__ = ["MeshAvatar", "Method", "Stages", "StepLoss", "compose", "create_method", "modelled_parts"]
+__all__ = ["MeshAvatar", "Method", "Stages", "StepLoss", "compose", "modelled_parts"]
 
 
 class Stages(NamedTuple):
@@ -235,14 +234,14 @@ class Method(ABC):
 
     Attributes:
         avatar: what is trained.
-        config: training options.
+        config: training options; options: of them, those of this method.
         adam_eps: epsilon of Adam [1].
     """
 
     adam_eps: float = 1e-8
 
     def __init__(self, avatar: MeshAvatar, config: TrainConfig) -> None:
-        self.avatar, self.config = avatar, config
+        self.avatar, self.config, self.options = avatar, config, config.own
 
     @classmethod
     @abstractmethod
@@ -331,18 +330,6 @@ class Method(ABC):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Takes over what `state_dict` gave."""
         return None
-
-
-def create_method(
-    sequence: MeshSequence,
-    coords: Mapping[str, np.ndarray],
-    views: Sequence[View],
-    config: TrainConfig,
-    device: str = "cpu",
-) -> Method:
-    """The method that `config.method` names, in its initial state; arguments as in `Method.create`."""
-    training: type[Method] = resolve(METHODS[config.method].training)
-    return training.create(sequence, coords, views, config, device)
 
 
 def modelled_parts(sequence: MeshSequence, config: TrainConfig) -> list[str]:

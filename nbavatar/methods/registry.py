@@ -9,46 +9,67 @@ entry here; its avatar derives from `MeshAvatar`, its training from `Method` (`n
 import importlib
 from typing import Any, NamedTuple
 
-__all__ = ["METHODS", "MethodEntry", "resolve"]
+__all__ = ["METHODS", "MethodEntry", "avatar_class", "options_class", "training_class"]
 
 
 class MethodEntry(NamedTuple):
     """Where a method lives and what it is called.
 
     Attributes:
-        avatar, training: its classes, `module:class`.
+        avatar: class derived from `MeshAvatar`, `module:class`.
+        training: class derived from `Method`, likewise.
+        options: frozen dataclass of its options (`nbavatar.config.core`), likewise; standard library only.
+        title: its name in texts.
         primitives: what its avatar is made of, in the plural.
     """
 
     avatar: str
     training: str
+    options: str
+    title: str
     primitives: str
-
-    def places(self) -> tuple[str, ...]:
-        """Its classes."""
-        return self.avatar, self.training
 
 
 METHODS: dict[str, MethodEntry] = {
     "billboards": MethodEntry(
         avatar="nbavatar.methods.billboards.avatar:Avatar",
         training="nbavatar.methods.billboards.training:BillboardTraining",
+        options="nbavatar.methods.billboards.options:BillboardsConfig",
+        title="NBAvatar, the paper's method",
         primitives="billboards",
     ),
     "gaussian_avatars": MethodEntry(
         avatar="nbavatar.methods.gaussian_avatars.avatar:GaussianAvatars",
         training="nbavatar.methods.gaussian_avatars.training:GaussianAvatarsTraining",
+        options="nbavatar.methods.gaussian_avatars.options:GaussianAvatarsConfig",
+        title="GaussianAvatars",
         primitives="Gaussians",
     ),
     "splatting_avatar": MethodEntry(
         avatar="nbavatar.methods.splatting_avatar.avatar:SplattingAvatar",
         training="nbavatar.methods.splatting_avatar.training:SplattingAvatarTraining",
+        options="nbavatar.methods.splatting_avatar.options:SplattingAvatarConfig",
+        title="SplattingAvatar",
         primitives="Gaussians",
     ),
 }
 
 
-def resolve(place: str) -> Any:
-    """The class at `module:class`."""
+def avatar_class(method: str) -> Any:
+    """Class of a method's avatars."""
+    return _resolve(METHODS[method].avatar)
+
+
+def training_class(method: str) -> Any:
+    """Class of a method's training."""
+    return _resolve(METHODS[method].training)
+
+
+def options_class(method: str) -> Any:
+    """Class of a method's options."""
+    return _resolve(METHODS[method].options)
+
+
+def _resolve(place: str) -> Any:
     module, _, name = place.partition(":")
     return getattr(importlib.import_module(module), name)

@@ -15,7 +15,7 @@ from nbavatar.errors import DataError, describe, parsing
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.tensors import read_tensors
 from nbavatar.methods.base import MeshAvatar
-from nbavatar.methods.registry import METHODS, resolve
+from nbavatar.methods.registry import METHODS, avatar_class
 
 __all__ = ["FORMAT", "load_avatar", "save_avatar"]
 
@@ -58,6 +58,6 @@ def load_avatar(path: str | os.PathLike[str], device: str | torch.device = "cpu"
         raise DataError.of(path, "method", expected=f"one of {', '.join(METHODS)}", found=describe(method))
     with parsing(path, "a whole avatar", damaged="contents that disagree"):
         state: dict[str, Tensor] = content["state"]
-        avatar: MeshAvatar = resolve(METHODS[method].avatar).rebuild(content, state, json.loads(content["record"]))
+        avatar: MeshAvatar = avatar_class(method).rebuild(content, state, json.loads(content["record"]))
         avatar.restore({**state, "faces": avatar.faces})
     return avatar.to(device).eval()

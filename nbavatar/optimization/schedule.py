@@ -12,7 +12,7 @@ under a time budget are not bit-identical.
 import math
 from typing import NamedTuple
 
-from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.training import TrainConfig
 
 __all__ = ["Plan", "plan_at", "total_steps"]
 
@@ -26,7 +26,7 @@ class Plan(NamedTuple):
         shrink: images are this many times smaller (a power of two).
         rate: factor on all learning rates.
         crop: side of the LPIPS crop [px], or None for the whole image.
-        perceptual: whether LPIPS is computed.
+        perceptual: whether LPIPS is computed, where the method has it in its loss.
     """
 
     shrink: int
@@ -59,5 +59,5 @@ def plan_at(progress: float, config: TrainConfig, side: int, step: int = 0) -> P
             turn = (progress - config.decay_from) / max(1.0 - config.decay_from, 1e-9)
             rate = config.final_rate + (1.0 - config.final_rate) * 0.5 * (1.0 + math.cos(math.pi * turn))
     crop = None if progress < config.lpips_full_until or shrink > 1 else config.lpips_crop
-    perceptual = config.weight_lpips > 0 and step % config.lpips_every == 0 and progress >= config.lpips_from
+    perceptual = step % config.lpips_every == 0 and progress >= config.lpips_from
     return Plan(shrink, rate, crop, perceptual)

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nbavatar.config.tables import Panel, TableLayout
+from nbavatar.methods.registry import METHODS
 from nbavatar.reporting.cells import COLUMNS, Source, plain
 from nbavatar.reporting.printed import Printed, deviating_marks, deviating_means
 
@@ -68,7 +69,8 @@ def describe_speeds(panel: Panel, results: Sequence[tuple[Mapping[str, Any], Sou
         size = f", {source.size[0]} x {source.size[1]} px" if source.size else ""
         speed = result["speed"]
         count = speed.get("primitives") or speed.get("billboards")
-        kind = "billboards" if speed.get("method", "billboards") == "billboards" else "Gaussians"
+        method = METHODS.get(speed.get("method") or "billboards")
+        kind = method.primitives if method else "primitives"
         seen.append(f"{result.get('device') or 'an unknown device'}{size}" + (f", {count} {kind}" if count else ""))
     remark = " (the paper: 1024 x 1024 px, on an RTX 4090)" if panel.reported else ""
     return ["Timings reproduced on " + "; ".join(dict.fromkeys(seen)) + remark + "."]

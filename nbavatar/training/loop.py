@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.views import ViewStore, ViewStream
 from nbavatar.errors import NBAvatarError
 from nbavatar.methods.base import MeshAvatar, Method

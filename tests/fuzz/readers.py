@@ -225,8 +225,8 @@ def _sheet(path: Path) -> None:
 
 def _options(path: Path) -> None:
     from nbavatar.cli.common import read_mapping
-    from nbavatar.config.avatar import TrainConfig
     from nbavatar.config.core import from_mapping
+    from nbavatar.config.training import TrainConfig
 
     from_mapping(TrainConfig, read_mapping(str(path), "--cfg"), "--cfg")
 

@@ -201,8 +201,8 @@ def config(folder: Path, name: str, entries: int = 0) -> Path:
 
 
 def options(folder: Path) -> Path:
-    from nbavatar.config.avatar import TrainConfig
     from nbavatar.config.core import to_mapping
+    from nbavatar.config.training import TrainConfig
 
     (folder / "o.json").write_text(json.dumps(to_mapping(TrainConfig())))
     return folder / "o.json"

@@ -19,13 +19,13 @@ def copy(tmp_path, monkeypatch):
     monkeypatch.setattr(imports, "ROOT", tmp_path / "nbavatar")
     caches = (
         *(provenance.code_digest, provenance.code_modules),
-        *(imports.source_of, imports._text, imports.is_neutral, imports.imports_of),
+        *(imports.source_of, imports._text, imports.is_neutral, imports.imports_of, imports.kinds_of),
     )
 
-    def digest(verb, method=None):
+    def digest(verb, methods=None):
         for function in caches:
             function.cache_clear()
-        return provenance.code_digest(verb, method)
+        return provenance.code_digest(verb, methods)
 
     yield tmp_path / "nbavatar", digest
     for function in caches:

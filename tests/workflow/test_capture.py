@@ -19,7 +19,12 @@ ROOT = Path(__file__).parents[2]
 TINY = {
     "crops": {"full": {"size": 32}},
     "stages": {
-        "train": {"steps": 12, "texels": 4, "lpips_crop": 32, "previews": 1, "unet": {"width": 4, "max_width": 8}},
+        "train": {
+            "steps": 12,
+            "lpips_crop": 32,
+            "previews": 1,
+            "billboards": {"texels": 4, "unet": {"width": 4, "max_width": 8}},
+        },
         "speed": {"repeats": 1, "warmup": 0},
         "video": {"seconds": 0.1, "max_frames": 2},
     },

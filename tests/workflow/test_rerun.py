@@ -93,7 +93,7 @@ def test_an_option_of_evaluation_runs_evaluation_only(edit):
 
 
 def test_an_option_of_one_variant_runs_that_variant_only(edit):
-    text = {"stages": {"train": {"channels": 4}}}
+    text = {"stages": {"train": {"billboards": {"channels": 4}}}}
     plan = edit("config/smoke.yaml", _config(variants__ch03=text))
     assert plan == {"train": 1, "render": 1, "evaluate": 1, "speed": 1, "table": 1, "figure": 1, "report": 1}
 

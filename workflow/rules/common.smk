@@ -121,6 +121,20 @@ def options(stage):
     return resolve
 
 
+def code_of(verb):
+    """Digest of the code behind a verb, of what the method of the variant in hand can reach."""
+
+    def resolve(wildcards):
+        return code_digest(verb, (method_of(wildcards.variant),))
+
+    return resolve
+
+
+def method_of(variant):
+    """Name of the method that a variant trains."""
+    return stage_options(RUN, "train", variant)["method"]
+
+
 def crop_options(wildcards):
     from nbavatar.config.core import to_mapping
 
@@ -446,6 +460,13 @@ def figure_files(name, what):
     if what == "sequences":
         return [meshes_for(s, layout.variant) for s in subjects]
     return sorted({f for s in subjects for f in frames_under(layout.protocol, s)})
+
+
+def figure_code(wildcards):
+    """Digest of the code behind a figure, of what the methods of its avatars can reach."""
+    layout = FIGURES[wildcards.figure]
+    shown = figure_files(wildcards.figure, "models")
+    return code_digest("figure", (method_of(layout.variant),) if shown else ())
 
 
 def timed_avatars(rows):

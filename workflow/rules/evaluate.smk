@@ -25,7 +25,7 @@ rule render:
     params:
         device=RUN.device,
         protocol=protocol_options,
-        code=code_digest("render"),
+        code=code_of("render"),
     shell:
         "nbavatar render --model {input.model:q} --meshes {input.meshes:q} --frames {input.frames:q}"
         " --protocol {params.protocol:q} --out {output:q} --device {params.device:q} > {log:q} 2>&1"
@@ -74,7 +74,7 @@ rule speed:
     params:
         device=RUN.device,
         cfg=options("speed"),
-        code=code_digest("speed"),
+        code=code_of("speed"),
     shell:
         "nbavatar speed --model {input.model:q} --meshes {input.meshes:q} --frames {input.frames[0]:q}"
         " --out {output:q} --device {params.device:q} --cfg {params.cfg:q} > {log:q} 2>&1"

@@ -72,7 +72,7 @@ rule video:
     params:
         device=RUN.device,
         cfg=options("video"),
-        code=code_digest("video"),
+        code=code_of("video"),
     shell:
         "nbavatar video --model {input.model:q} --meshes {input.meshes:q} --camera {input.camera:q} --kind {wildcards.kind:q}"
         " --out {output.video:q} --device {params.device:q} --cfg {params.cfg:q} > {log:q} 2>&1"
@@ -106,7 +106,7 @@ rule figure:
     params:
         stem=lambda w, output: output.png[:-4],
         given=given([RUN.figures] if RUN.figures else []),
-        code=code_digest("figure"),
+        code=figure_code,
     shell:
         "nbavatar figure --figure {wildcards.figure:q} --layout {input.layout:q} --renders {input.renders:q}"
         " --frames {input.frames:q} --evals {input.evals:q} --speeds {input.speeds:q} --histories {input.histories:q}"

@@ -44,7 +44,7 @@ rule tradeoff:
         folder=lambda w, output: Path(output.result).parent,
         protocol=lambda w: protocol_text(RUN.tradeoff.protocol),
         side=RUN.tradeoff.side,
-        code=code_digest("tradeoff"),
+        code=code_of("tradeoff"),
     shell:
         "nbavatar tradeoff {params.what:q} --model {input.model:q} --meshes {input.meshes:q} --frames {input.frames:q}"
         " --train-frames {input.train:q} --protocol {params.protocol:q} --sheet {input.sheet:q} --side {params.side:q}"

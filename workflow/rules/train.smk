@@ -28,7 +28,7 @@ rule train:
     params:
         device=RUN.device,
         cfg=options("train"),
-        code=code_digest("train"),
+        code=code_of("train"),
     shell:
         "nbavatar train --frames {input.frames:q} --meshes {input.meshes:q} --spectral {input.spectral:q}"
         " --out {output.model:q} --history {output.history:q} --device {params.device:q} --cfg {params.cfg:q} > {log:q} 2>&1"

@@ -32,7 +32,7 @@ _DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 @dataclasses.dataclass(frozen=True)
 class Architecture:
-    """Numbers that fix an avatar's tensors and how it is rendered; see `nbavatar.config.avatar.TrainConfig`."""
+    """Numbers that fix an avatar's tensors and how it is rendered; see `nbavatar.config.training.TrainConfig`."""
 
     channels: int
     texels: int

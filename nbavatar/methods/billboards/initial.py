@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.errors import DataError
 from nbavatar.mesh.frames import face_frames
@@ -15,6 +15,7 @@ from nbavatar.methods.base import modelled_parts
 from nbavatar.methods.billboards.avatar import Architecture, Avatar
 from nbavatar.methods.billboards.billboards import Billboards, gaussian_alpha_logits, initial_half_extents
 from nbavatar.methods.billboards.losses import knn_graph
+from nbavatar.methods.billboards.options import BillboardsConfig
 from nbavatar.methods.billboards.refine import Refinement, displacement_basis
 
 __all__ = ["initial_avatar", "neighbour_graph"]
@@ -37,40 +38,41 @@ def initial_avatar(
     Raises:
         DataError: spectral coordinates of a part are missing or of another vertex count.
     """
+    options: BillboardsConfig = config.own
     torch.manual_seed(config.seed)
     parts = modelled_parts(sequence, config)
-    _check_coords(sequence, coords, parts, needed=config.init == "spectral" or config.refine.modes > 0)
+    _check_coords(sequence, coords, parts, needed=options.init == "spectral" or options.refine.modes > 0)
     extents, features = [], []
     for part in parts:
         mesh = sequence.parts[part]
         rest, faces = torch.from_numpy(np.asarray(mesh.rest)).float(), torch.from_numpy(np.asarray(mesh.faces))
-        size = initial_half_extents(rest, faces, face_frames(rest, faces), margin=config.extent_margin)
+        size = initial_half_extents(rest, faces, face_frames(rest, faces), margin=options.extent_margin)
         extents.append(size)
-        features.append(_initial_features(rest, faces, size, coords.get(part), config))
+        features.append(_initial_features(rest, faces, size, coords.get(part), options))
     count = sum(len(size) for size in extents)
     logits = gaussian_alpha_logits(
-        config.texels,
-        sigma=config.alpha_sigma,
-        peak=config.alpha_peak,
-        floor=min(config.alpha_floor, config.alpha_peak),
+        options.texels,
+        sigma=options.alpha_sigma,
+        peak=options.alpha_peak,
+        floor=min(options.alpha_floor, options.alpha_peak),
     )
     billboards = Billboards(torch.cat(extents), torch.cat(features), logits.expand(count, -1, -1).contiguous())
     refinement = None
-    if config.refine.modes > 0:
+    if options.refine.modes > 0:
         basis = {part: torch.from_numpy(np.asarray(coords[part])) for part in parts}
-        refinement = Refinement(frames, displacement_basis(basis, config.refine.modes), rigid=config.refine.rigid)
+        refinement = Refinement(frames, displacement_basis(basis, options.refine.modes), rigid=options.refine.rigid)
     return Avatar(
         Architecture(
-            channels=_channels(config),
-            texels=config.texels,
-            deferred=config.deferred,
-            unet_width=config.unet.width,
-            unet_depth=config.unet.depth,
-            unet_max_width=config.unet.max_width,
-            unet_convs=config.unet.convs,
-            roi=config.roi,
-            roi_margin=config.roi_margin,
-            order=config.order,
+            channels=_channels(options),
+            texels=options.texels,
+            deferred=options.deferred,
+            unet_width=options.unet.width,
+            unet_depth=options.unet.depth,
+            unet_max_width=options.unet.max_width,
+            unet_convs=options.unet.convs,
+            roi=options.roi,
+            roi_margin=options.roi_margin,
+            order=options.order,
         ),
         {part: torch.from_numpy(np.asarray(sequence.parts[part].faces)) for part in parts},
         {part: len(sequence.parts[part].rest) for part in parts},
@@ -81,33 +83,34 @@ def initial_avatar(
 
 def neighbour_graph(avatar: Avatar, sequence: MeshSequence, config: TrainConfig) -> Tensor | None:
     """Neighbours of every billboard in rest pose, part by part, int64 (F, K); None when the term has no effect."""
-    if config.weight_knn == 0 or config.neighbours < 2:
+    options: BillboardsConfig = config.own
+    if options.weight_knn == 0 or options.neighbours < 2:
         return None
     rest = torch.from_numpy(np.concatenate([sequence.parts[part].rest for part in avatar.parts]))
     centroids = rest[avatar.faces.cpu()].mean(1)
-    return knn_graph(centroids, avatar.face_groups(), config.neighbours, include_self=config.include_self)
+    return knn_graph(centroids, avatar.face_groups(), options.neighbours, include_self=options.include_self)
 
 
-def _channels(config: TrainConfig) -> int:
-    return config.channels if config.deferred else 3
+def _channels(options: BillboardsConfig) -> int:
+    return options.channels if options.deferred else 3
 
 
 def _initial_features(
-    rest: Tensor, faces: Tensor, size: Tensor, coords: np.ndarray | None, config: TrainConfig
+    rest: Tensor, faces: Tensor, size: Tensor, coords: np.ndarray | None, options: BillboardsConfig
 ) -> Tensor:
     """Neural textures float32 (F, T, T, C) before training."""
-    shape = (len(faces), config.texels, config.texels, _channels(config))
-    if not config.deferred:
+    shape = (len(faces), options.texels, options.texels, _channels(options))
+    if not options.deferred:
         return torch.zeros(shape)  # mid grey behind the sigmoid
-    if config.init == "random" or coords is None:
+    if options.init == "random" or coords is None:
         return _RANDOM_SPREAD * torch.randn(shape)
-    used = torch.from_numpy(np.asarray(coords, dtype=np.float32)[:, : config.channels])
+    used = torch.from_numpy(np.asarray(coords, dtype=np.float32)[:, : options.channels])
     features = torch.zeros(shape)
     # Channels beyond the basis start at zero.
-    if config.texels == 1:
+    if options.texels == 1:
         features[..., : used.shape[1]] = used[faces].mean(1)[:, None, None]
     else:
-        known = texel_values(used.numpy(), rest.numpy(), faces.numpy(), size.numpy(), config.texels)
+        known = texel_values(used.numpy(), rest.numpy(), faces.numpy(), size.numpy(), options.texels)
         features[..., : used.shape[1]] = torch.from_numpy(known)
     return features
 

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.views import Sample
 from nbavatar.methods.base import compose
 from nbavatar.methods.billboards.avatar import Anchor, Avatar, Window
 from nbavatar.methods.billboards.losses import loss_delta, loss_dice, loss_dice_haha, loss_knn
+from nbavatar.methods.billboards.options import BillboardsConfig
 from nbavatar.methods.photometric import loss_dssim, loss_l1, loss_mse
 from nbavatar.optimization.schedule import Plan
 
@@ -84,6 +85,7 @@ def step_loss(
     Returns:
         total loss, its unweighted terms (detached), and the rendered window.
     """
+    options: BillboardsConfig = config.own
     device = avatar.faces.device
     background = torch.rand(3, generator=random).to(device)
     corner = torch.rand(2, generator=random).tolist()
@@ -95,7 +97,7 @@ def step_loss(
         sample.K.to(device),
         sample.width,
         sample.height,
-        precision=config.precision,
+        precision=options.precision,
     )
     target = target_in(window, sample)
     truth = target.colour + (1.0 - target.alpha) * background[:, None, None]
@@ -105,36 +107,36 @@ def step_loss(
     nb_alpha = torch.lerp(window.nb_alpha, target.alpha, target.ignored)
 
     pixels = sample.width * sample.height
-    terms, weights = _colours(image, truth, pixels, config)
+    terms, weights = _colours(image, truth, pixels, options)
     if lpips is not None and plan.perceptual:
         terms["lpips"] = _perceptual(lpips, image, truth, plan.crop, corner, pixels)
         # Rarer but heavier: the mean pull is the same.
-        weights["lpips"] = config.weight_lpips * config.lpips_every
-    if config.weight_nb > 0:
-        if config.dice == "milletari":
+        weights["lpips"] = options.weight_lpips * config.lpips_every
+    if options.weight_nb > 0:
+        if options.dice == "milletari":
             terms["nb"] = loss_dice(nb_alpha, target.alpha, missed=target.missed)
         else:
             terms["nb"] = loss_dice_haha(nb_alpha, target.alpha)
-        weights["nb"] = config.weight_nb
-    if neighbours is not None and config.weight_knn > 0 and keep is None:
+        weights["nb"] = options.weight_nb
+    if neighbours is not None and options.weight_knn > 0 and keep is None:
         terms["knn"] = loss_knn(posed.means, posed.quats, posed.half_extents, neighbours)
-        weights["knn"] = config.weight_knn
-    if config.weight_delta > 0:
+        weights["knn"] = options.weight_knn
+    if options.weight_delta > 0:
         terms["delta"] = loss_delta(avatar.billboards.mu)
-        weights["delta"] = config.weight_delta
+        weights["delta"] = options.weight_delta
     if avatar.refinement is not None:
         terms["refine"] = anchor.penalty
-        weights["refine"] = config.refine.weight
+        weights["refine"] = options.refine.weight
     total = torch.stack([weight * terms[name] for name, weight in weights.items()]).sum()
     return total, {name: value.detach() for name, value in terms.items()}, window
 
 
 def _colours(
-    image: Tensor, truth: Tensor, pixels: int, config: TrainConfig
+    image: Tensor, truth: Tensor, pixels: int, options: BillboardsConfig
 ) -> tuple[dict[str, Tensor], dict[str, float]]:
     """Terms that compare two pictures pixel by pixel or window by window, and the weights of those that count."""
     terms = {"mse": loss_mse(image, truth, pixels=pixels)}
-    weights = {"mse": config.weight_mse, "l1": config.weight_l1, "dssim": config.weight_dssim}
+    weights = {"mse": options.weight_mse, "l1": options.weight_l1, "dssim": options.weight_dssim}
     weights = {name: weight for name, weight in weights.items() if weight > 0}
     if "l1" in weights:
         terms["l1"] = loss_l1(image, truth, pixels=pixels)

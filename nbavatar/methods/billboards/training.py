@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
 from nbavatar.errors import ConfigError
@@ -19,6 +19,7 @@ from nbavatar.methods.billboards.compression.reduce import size_textures
 from nbavatar.methods.billboards.initial import initial_avatar, neighbour_graph
 from nbavatar.methods.billboards.objective import step_loss
 from nbavatar.methods.billboards.offsets import SmoothOffsets
+from nbavatar.methods.billboards.options import BillboardsConfig
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import Plan
 
@@ -36,15 +37,17 @@ class BillboardTraining(Method):
     """
 
     avatar: Avatar
+    options: BillboardsConfig
 
     def __init__(
         self, avatar: Avatar, neighbours: Tensor | None, config: TrainConfig, offsets: SmoothOffsets | None = None
     ) -> None:
         super().__init__(avatar, config)
         self.neighbours, self.offsets = neighbours, offsets
-        if config.texel_sharing > 0:
+        share = self.options.texel_sharing
+        if share > 0:
             for textures in (avatar.billboards.features, avatar.billboards.alpha_logit):
-                textures.register_hook(lambda gradient: shared_gradient(gradient, config.texel_sharing))
+                textures.register_hook(lambda gradient: shared_gradient(gradient, share))
 
     @classmethod
     def create(
@@ -56,24 +59,25 @@ class BillboardTraining(Method):
         device: str,
     ) -> "BillboardTraining":
         """See `Method.create`."""
-        if max(config.weight_mse, config.weight_l1, config.weight_dssim) == 0:
-            weights = "--cfg.weight_mse, weight_l1, weight_dssim"
+        options: BillboardsConfig = config.own
+        if max(options.weight_mse, options.weight_l1, options.weight_dssim) == 0:
+            weights = "--cfg.billboards: weight_mse, weight_l1, weight_dssim"
             raise ConfigError.of(weights, expected="one above 0, or no colour is learnt", found="three zeros")
         frames = [sequence.frames[row] for row in sorted({view.row for view in views})]
         avatar = initial_avatar(sequence, coords, frames, config).to(device)
         neighbours = neighbour_graph(avatar, sequence, config)
-        offsets = SmoothOffsets(avatar, sequence, coords) if config.rates.offset > 0 else None
+        offsets = SmoothOffsets(avatar, sequence, coords) if options.rates.offset > 0 else None
         return cls(avatar, None if neighbours is None else neighbours.to(device), config, offsets)
 
     def lpips_net(self) -> str | None:
         """See `Method.lpips_net`."""
-        return self.config.lpips_net if self.config.weight_lpips > 0 else None
+        return self.config.lpips_net if self.options.weight_lpips > 0 else None
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """See `Method.parameter_groups`."""
         groups = parameter_groups(self.avatar, self.config)
         if self.offsets is not None:
-            rates = self.config.rates
+            rates = self.options.rates
             field = {"name": "offset", "params": [self.offsets.coefficients], "final": rates.position_final}
             groups.append({**field, "lr": rates.offset * self.config.rate_factor})
         return groups
@@ -98,12 +102,12 @@ class BillboardTraining(Method):
 
     def finish(self, meshes: Mapping[str, Tensor], views: Sequence[View]) -> Avatar:
         """Fewer billboards and smaller textures, where the options say so."""
-        avatar, config = self.avatar, self.config
-        if config.prune_margin is not None:
-            avatar = prune(avatar, meshes, views, margin=config.prune_margin, most_views=_SAMPLED_VIEWS)
-        if config.texture_density is not None:
+        avatar, options = self.avatar, self.options
+        if options.prune_margin is not None:
+            avatar = prune(avatar, meshes, views, margin=options.prune_margin, most_views=_SAMPLED_VIEWS)
+        if options.texture_density is not None:
             footprints = largest_footprints(avatar, meshes, views, most_views=_SAMPLED_VIEWS)
-            avatar = size_textures(avatar, texels_of(footprints, config.texture_density))
+            avatar = size_textures(avatar, texels_of(footprints, options.texture_density))
         return avatar
 
 
@@ -119,21 +123,21 @@ def shared_gradient(gradient: Tensor, share: float) -> Tensor:
 
 def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]]:
     """Adam groups with the rates of the supplement (`Method.parameter_groups`)."""
-    billboards, rates = avatar.billboards, config.rates
+    billboards, rates = avatar.billboards, config.own.rates
     groups: list[dict[str, Any]] = [
         {"name": "position", "lr": rates.position, "params": [billboards.mu], "final": rates.position_final},
         {"name": "rotation", "lr": rates.rotation, "params": [billboards.quat]},
         {"name": "scale", "lr": rates.scale, "params": [billboards.log_scale]},
         {
             "name": "features",
-            "lr": rates.features if config.deferred else rates.colour,
+            "lr": rates.features if config.own.deferred else rates.colour,
             "params": [billboards.features],
         },
         {"name": "alpha", "lr": rates.alpha, "params": [billboards.alpha_logit]},
     ]
     if avatar.unet is not None:
         network = list(avatar.unet.parameters())
-        groups.append({"name": "renderer", "lr": rates.renderer, "params": network, "clip": config.clip})
+        groups.append({"name": "renderer", "lr": rates.renderer, "params": network, "clip": config.own.clip})
     if avatar.refinement is not None:
-        groups.append({"name": "refine", "lr": config.refine.rate, "params": list(avatar.refinement.parameters())})
+        groups.append({"name": "refine", "lr": config.own.refine.rate, "params": list(avatar.refinement.parameters())})
     return [{**group, "lr": group["lr"] * config.rate_factor} for group in groups]

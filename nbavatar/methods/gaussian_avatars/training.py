@@ -13,11 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
 from nbavatar.methods.base import StepLoss, modelled_parts
 from nbavatar.methods.gaussian_avatars.avatar import BoundAnchor, GaussianAvatars
+from nbavatar.methods.gaussian_avatars.options import GaussianAvatarsConfig
 from nbavatar.methods.gaussians.training import GaussianTraining, camera_extent
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import Plan
@@ -31,10 +32,10 @@ class GaussianAvatarsTraining(GaussianTraining):
     """GaussianAvatars in training."""
 
     avatar: GaussianAvatars
+    options: GaussianAvatarsConfig
 
     def __init__(self, avatar: GaussianAvatars, config: TrainConfig, extent: float) -> None:
-        self.options = config.gaussian_avatars
-        super().__init__(avatar, config, self.options.density, self.options.iterations, extent)
+        super().__init__(avatar, config, config.own.density, config.own.iterations, extent)
 
     @classmethod
     def create(
@@ -46,7 +47,7 @@ class GaussianAvatarsTraining(GaussianTraining):
         device: str,
     ) -> "GaussianAvatarsTraining":
         """See `Method.create`; spectral coordinates are not used."""
-        options, parts = config.gaussian_avatars, modelled_parts(sequence, config)
+        options, parts = config.own, modelled_parts(sequence, config)
         faces = {part: torch.from_numpy(np.asarray(sequence.parts[part].faces)) for part in parts}
         random = torch.Generator().manual_seed(config.seed)
         colour = _COLOUR_SPREAD * torch.rand((sum(map(len, faces.values())), 3), generator=random)

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from nbavatar.config.avatar import TrainConfig
-from nbavatar.config.baselines import DensityConfig
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.views import Sample, View
 from nbavatar.methods.base import Method
 from nbavatar.methods.gaussians.avatar import GaussianAvatar, PosedGaussians
 from nbavatar.methods.gaussians.density import Statistics, densify, remove, reset_opacity
 from nbavatar.methods.gaussians.losses import Pair, compare
+from nbavatar.methods.gaussians.options import DensityConfig
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import Plan, total_steps
 

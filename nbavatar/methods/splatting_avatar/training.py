@@ -14,13 +14,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
 from nbavatar.methods.base import StepLoss, modelled_parts
 from nbavatar.methods.gaussians.losses import Pair
 from nbavatar.methods.gaussians.training import GaussianTraining
 from nbavatar.methods.splatting_avatar.avatar import EmbeddedAnchor, SplattingAvatar
+from nbavatar.methods.splatting_avatar.options import SplattingAvatarConfig
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import Plan
 
@@ -35,10 +36,10 @@ class SplattingAvatarTraining(GaussianTraining):
     """SplattingAvatar in training."""
 
     avatar: SplattingAvatar
+    options: SplattingAvatarConfig
 
     def __init__(self, avatar: SplattingAvatar, config: TrainConfig) -> None:
-        self.options = config.splatting_avatar
-        super().__init__(avatar, config, self.options.density, self.options.iterations, self.options.extent)
+        super().__init__(avatar, config, config.own.density, config.own.iterations, config.own.extent)
 
     @classmethod
     def create(
@@ -50,7 +51,7 @@ class SplattingAvatarTraining(GaussianTraining):
         device: str,
     ) -> "SplattingAvatarTraining":
         """See `Method.create`; spectral coordinates are not used."""
-        options, parts = config.splatting_avatar, modelled_parts(sequence, config)
+        options, parts = config.own, modelled_parts(sequence, config)
         meshes = [sequence.parts[part] for part in parts]
         first = np.cumsum([0, *(len(mesh.rest) for mesh in meshes)])
         rest = torch.from_numpy(np.concatenate([np.asarray(mesh.rest, np.float32) for mesh in meshes]))

@@ -20,15 +20,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.config.avatar import TrainConfig, UNetConfig
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.synthetic.scene import full_scene
 from nbavatar.data.views import Sample, View
 from nbavatar.devices import device_name, lease_device, peak_memory_mb
-from nbavatar.methods.base import create_method
 from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.losses import loss_delta, loss_knn
+from nbavatar.methods.billboards.options import BillboardsConfig, UNetConfig
 from nbavatar.methods.billboards.region import full_region, shift_camera
 from nbavatar.methods.billboards.training import BillboardTraining
+from nbavatar.methods.create import create_method
 from nbavatar.metrics.lpips import load_lpips
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import plan_at
@@ -60,13 +61,15 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 def _measure(args: argparse.Namespace, device: str) -> dict[str, Any]:
     config = TrainConfig(
-        texels=args.texels,
-        unet=UNetConfig(width=args.width, convs=args.convs, max_width=args.max_width),
         lpips_crop=args.lpips_crop,
         schedule="paper",
-        init="random",
-        roi=False,
-        precision=args.precision,
+        billboards=BillboardsConfig(
+            texels=args.texels,
+            unet=UNetConfig(width=args.width, convs=args.convs, max_width=args.max_width),
+            init="random",
+            roi=False,
+            precision=args.precision,
+        ),
     )
     method, sample, verts = _scene(args.size, config, device)
     lpips = load_lpips(config.lpips_net).to(device)
@@ -164,7 +167,7 @@ def _parts(
         (values.sum() + opacity.sum()).backward()
 
     def decode() -> None:
-        colour, opacity = avatar.decode(features, alpha, method.config.precision)
+        colour, opacity = avatar.decode(features, alpha, method.config.own.precision)
         (colour.sum() + opacity.sum()).backward()
 
     def meshes() -> None:

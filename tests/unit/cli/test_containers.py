@@ -13,18 +13,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from nbavatar.config.avatar import TrainConfig, UNetConfig
 from nbavatar.config.core import to_mapping
 from nbavatar.io.framepack import FramePack
 from tests.scenes.toy import write_scene
+from tests.scenes.training import train_config
 from tests.unit.disks import fill
 from tests.unit.users import OTHER
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[3]
-CONFIG = TrainConfig(
-    steps=2, texels=4, unet=UNetConfig(width=4, depth=3, max_width=8, convs=1), weight_lpips=0.0, previews=1,
+CONFIG = train_config(
+    steps=2, texels=4, unet={"width": 4, "depth": 3, "max_width": 8, "convs": 1}, weight_lpips=0.0, previews=1,
     coarse_side=16, prefetch=2,
 )  # fmt: skip
 

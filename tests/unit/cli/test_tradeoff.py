@@ -9,10 +9,11 @@ import torch
 
 from nbavatar.cli import main as cli
 from nbavatar.cli import tradeoff
-from nbavatar.config.avatar import TrainConfig
+from nbavatar.config.core import merge
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.records import read_json
 from tests.scenes.toy import SIZE, rewritten, write_scene
+from tests.scenes.training import train_config, train_options
 
 SHEET = {
     "exact": {"roi": False},
@@ -46,7 +47,7 @@ def measured(tmp_path_factory) -> dict:
     model, packs = str(folder / "full" / "model.pt"), [str(path) for path in scene["packs"]]
     common = ["--meshes", str(scene["meshes"]), "--device", "cpu"]
     train = ["train", "--frames", *packs[:2], *common, "--spectral", str(scene["spectral"]), "--out", model]
-    assert cli([*train, "--cfg", json.dumps(cfg)]) == 0
+    assert cli([*train, "--cfg", json.dumps(train_options(cfg))]) == 0
     words = ["--model", model, *common, "--frames", packs[2], "--train-frames", *packs[:2]]
     words += ["--sheet", json.dumps(SHEET), "--out", str(folder / "out")]
     assert sweep(*words) == 0
@@ -118,7 +119,7 @@ def test_presets_of_another_training_are_refused(measured, tmp_path, capsys) -> 
 
 
 def test_training_takes_order_and_window_from_a_preset(tmp_path) -> None:
-    from nbavatar.cli.common import training_preset
+    from nbavatar.cli.train import _with_preset
 
     setting = {"order": "center", "roi": False, "precision": "bf16", "texels": 2}
     entry = {
@@ -129,9 +130,9 @@ def test_training_takes_order_and_window_from_a_preset(tmp_path) -> None:
     }
     content = {"kind": "nbavatar presets", "format": 1, "model": "m", "measured": [entry | {"importance": None}]}
     (tmp_path / "presets.json").write_text(json.dumps(content))
-    config = training_preset("fast", str(tmp_path / "presets.json"), TrainConfig(texels=8))
-    assert (config.order, config.roi, config.precision) == ("center", False, "bf16")
-    assert config.texels == 8 and config.roi_margin == TrainConfig().roi_margin
+    config = _with_preset("fast", str(tmp_path / "presets.json"), train_config(texels=8))
+    assert (config.own.order, config.own.roi, config.own.precision) == ("center", False, "bf16")
+    assert config.own.texels == 8 and config.own.roi_margin == train_config().own.roi_margin
 
 
 def test_a_training_keeps_textures_by_their_footprint(measured) -> None:
@@ -140,7 +141,8 @@ def test_a_training_keeps_textures_by_their_footprint(measured) -> None:
     scene, out = measured["scene"], str(measured["folder"] / "sized" / "model.pt")
     words = ["train", "--frames", *measured["packs"][:2], *measured["common"], "--spectral", str(scene["spectral"])]
     options = load_avatar(measured["model"]).record["config"]
-    assert cli([*words, "--out", out, "--cfg", json.dumps({**options, "texture_density": 0.1})]) == 0
+    options = merge(options, {"billboards": {"texture_density": 0.1}})
+    assert cli([*words, "--out", out, "--cfg", json.dumps(options)]) == 0
     sized, whole = load_avatar(out), load_avatar(measured["model"])
     # An octahedron's face is some 30 px wide here, a tetrahedron's a third of that: 0.1 texels a pixel make 4 and 2.
     assert sized.billboards.sizes.tolist()[:8] == [4] * 8

@@ -14,11 +14,12 @@ from nbavatar.evaluation.render import render_views
 from nbavatar.io.framepack import FramePack
 from nbavatar.methods.storage import load_avatar
 from tests.scenes.toy import FRAMES, SIZE, write_scene
+from tests.scenes.training import train_options
 
-TRAIN = {
+TRAIN = train_options({
     "steps": 8, "texels": 4, "unet": {"width": 4, "depth": 3, "max_width": 8, "convs": 1}, "weight_lpips": 0.0,
     "previews": 0, "coarse_side": 16,
-}  # fmt: skip
+})  # fmt: skip
 
 
 @pytest.fixture(scope="module")

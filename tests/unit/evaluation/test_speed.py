@@ -7,6 +7,7 @@ import pytest
 from nbavatar.cli import main
 from nbavatar.io.records import read_json
 from tests.scenes.toy import SIZE, write_scene
+from tests.scenes.training import train_options
 
 
 @pytest.mark.parametrize("deferred", [True, False])
@@ -19,7 +20,8 @@ def test_speed_times_every_stage_of_the_papers_table(tmp_path, deferred: bool) -
     common = ["--meshes", str(scene["meshes"]), "--device", "cpu"]
     frames = ["--frames", *(str(path) for path in scene["packs"][:1])]
     model, out = str(tmp_path / "model.pt"), str(tmp_path / "speed.json")
-    train = ["train", *frames, *common, "--spectral", str(scene["spectral"]), "--out", model, "--cfg", json.dumps(cfg)]
+    train = ["train", *frames, *common, "--spectral", str(scene["spectral"]), "--out", model]
+    train += ["--cfg", json.dumps(train_options(cfg))]
     assert main(train) == 0
     timing = json.dumps({"frames": 2, "repeats": 3, "warmup": 1})
     assert main(["speed", "--model", model, *frames, *common, "--out", out, "--cfg", timing]) == 0

@@ -15,11 +15,12 @@ from nbavatar.io.framepack import FramePack
 from nbavatar.io.images import decode_image
 from nbavatar.io.video import VideoWriter, probe_video, read_video
 from tests.scenes.toy import FRAMES, SIZE, write_scene
+from tests.scenes.training import train_options
 
-TRAIN = {
+TRAIN = train_options({
     "steps": 4, "texels": 4, "unet": {"width": 4, "depth": 3, "max_width": 8, "convs": 1}, "weight_lpips": 0.0,
     "previews": 0, "coarse_side": 16,
-}  # fmt: skip
+})  # fmt: skip
 
 
 @pytest.fixture(scope="module")

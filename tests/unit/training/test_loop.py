@@ -16,22 +16,23 @@ import pytest
 import torch
 
 from nbavatar.cli import main
-from nbavatar.config.avatar import TrainConfig, UNetConfig
 from nbavatar.config.core import to_mapping
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import MeshSequence, Part, read_sequence
 from nbavatar.data.views import ViewStore, views_of
 from nbavatar.errors import DataError, NBAvatarError
 from nbavatar.io.framepack import FramePack
-from nbavatar.methods.base import create_method
 from nbavatar.methods.billboards.initial import initial_avatar
 from nbavatar.methods.billboards.training import parameter_groups
+from nbavatar.methods.create import create_method
 from nbavatar.training.loop import train
 from nbavatar.training.state import RunFolder
 from tests.scenes.toy import sequence, write_scene
+from tests.scenes.training import train_config
 from tests.unit.disks import fill
 
-CONFIG = TrainConfig(
-    steps=12, texels=4, unet=UNetConfig(width=4, depth=3, max_width=8, convs=1), weight_lpips=0.0, previews=0,
+CONFIG = train_config(
+    steps=12, texels=4, unet={"width": 4, "depth": 3, "max_width": 8, "convs": 1}, weight_lpips=0.0, previews=0,
     checkpoint_seconds=0.0, coarse_side=16, prefetch=2,
 )  # fmt: skip
 
@@ -109,7 +110,7 @@ def test_bad_steps_are_skipped_counted_and_end_the_training_with_one_line(scene,
     def broken(x, y):
         return (x - y).mean().reshape(1) * (float("nan") if next(calls) in (2, 3, 6) else 1.0)
 
-    config = replace(CONFIG, weight_lpips=0.1)
+    config = train_config(CONFIG, weight_lpips=0.1)
     avatar, summary = run(scene, config, tmp_path / "a", lpips=broken)
     assert summary["skipped"] == 3 and summary["finished"]
     assert all(torch.isfinite(p).all() for p in avatar.parameters())
@@ -163,13 +164,13 @@ def test_a_hundred_times_the_rate_recovers_or_stops_with_a_line(scene, tmp_path)
     ids=str,
 )
 def test_every_variant_trains(scene, tmp_path, change: dict) -> None:
-    avatar, summary = run(scene, replace(CONFIG, **({"steps": 8} | change)), tmp_path)
+    avatar, summary = run(scene, train_config(CONFIG, **({"steps": 8} | change)), tmp_path)
     assert summary["finished"] and summary["skipped"] == 0
     assert all(torch.isfinite(p).all() for p in avatar.parameters())
 
 
 def test_refinement_moves_meshes_of_training_frames(scene, tmp_path) -> None:
-    config = replace(CONFIG, refine=replace(CONFIG.refine, modes=3, rate=1e-3))
+    config = train_config(CONFIG, refine={"modes": 3, "rate": 1e-3})
     avatar, _ = run(scene, config, tmp_path)
     assert avatar.refinement is not None
     assert avatar.refinement.get_parameter("bend_head").abs().max() > 0
@@ -218,7 +219,7 @@ def test_a_hundred_thousand_faces_train(tmp_path) -> None:
     fine = MeshSequence(whole.frames, {"head": _sphere(224, 224, len(whole.frames))}, {})
     assert len(fine.parts["head"].faces) >= 100_000
     scene = write_scene(tmp_path / "fine", size=128, meshes=fine)
-    _, summary = run(scene, replace(CONFIG, steps=2, texels=2, schedule="paper"), tmp_path / "state")
+    _, summary = run(scene, train_config(CONFIG, steps=2, texels=2, schedule="paper"), tmp_path / "state")
     assert summary["skipped"] == 0 and summary["primitives"] == len(fine.parts["head"].faces)
 
 
@@ -360,8 +361,9 @@ def test_terminated_it_saves_and_says_how_to_go_on(scene, tmp_path) -> None:
     [
         ({"--meshes": "absent.npz"}, "absent.npz: expected a file (--meshes), found no such file"),
         ({"--cfg": '{"stepz": 3}'}, "unknown key 'stepz'; did you mean 'steps'?"),
+        ({"--cfg": '{"channels": 3}'}, "unknown key 'channels'; write billboards: {channels: ...}"),
         ({"--cfg": '{"parts": ["left_hand"]}'}, "expected parts of the meshes (head, right_hand), found left_hand"),
-        ({"--cfg": '{"channels": 0}'}, "channels: expected at least 1"),
+        ({"--cfg": '{"billboards": {"channels": 0}}'}, "billboards.channels: expected at least 1"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_2(scene, tmp_path, capsys, change: dict, line: str) -> None:

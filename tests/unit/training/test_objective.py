@@ -1,6 +1,5 @@
 """The loss of a step: the paper's stays the paper's; L1 and D-SSIM on coarse pictures and pixels without truth."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,18 +7,19 @@ import pytest
 import torch
 import yaml
 
-from nbavatar.config.avatar import TrainConfig, UNetConfig
 from nbavatar.config.core import from_mapping
+from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import read_sequence
 from nbavatar.data.views import Sample, View
 from nbavatar.errors import ConfigError
-from nbavatar.methods.base import create_method
 from nbavatar.methods.billboards import training as training
 from nbavatar.methods.billboards.avatar import compose
 from nbavatar.methods.billboards.losses import loss_delta, loss_dice, loss_knn
 from nbavatar.methods.billboards.objective import step_loss
+from nbavatar.methods.create import create_method
 from nbavatar.optimization.schedule import Plan
 from nbavatar.rendering.billboards.functional import render_billboards
+from tests.scenes.training import train_config, train_options
 from tests.unit.methods.billboards.test_losses import plain_dssim
 from tests.unit.training.test_loop import run, same
 
@@ -65,20 +65,20 @@ def papers_loss(avatar, sample, anchor, neighbours, lpips, plan, config, random)
 
 
 def test_training_by_papers_options_has_the_papers_loss_to_the_bit(scene, tmp_path, monkeypatch) -> None:
-    config = from_mapping(TrainConfig, {**PAPER, **SMALL}, "train")
+    config = from_mapping(TrainConfig, {**PAPER, **train_options(SMALL)}, "train")
     ours, _ = run(scene, config, tmp_path / "ours", lpips=distance)
     monkeypatch.setattr(training, "step_loss", papers_loss)
     papers, _ = run(scene, config, tmp_path / "papers", lpips=distance)
     assert same(ours, papers)
     monkeypatch.undo()
-    other, _ = run(scene, replace(config, weight_l1=0.8, weight_dssim=0.2), tmp_path / "other", lpips=distance)
+    other, _ = run(scene, train_config(config, weight_l1=0.8, weight_dssim=0.2), tmp_path / "other", lpips=distance)
     assert not same(ours, other)
 
 
 def test_l1_and_dssim_are_those_of_the_whole_picture_whatever_the_window_and_the_stage(scene, rng) -> None:
     """20 x 13 px, as a coarse stage may have: the window reaches over the border; a block has no truth."""
-    config = TrainConfig(
-        texels=4, unet=UNetConfig(width=4, depth=3, max_width=8, convs=1), init="random", weight_mse=0.0,
+    config = train_config(
+        texels=4, unet={"width": 4, "depth": 3, "max_width": 8, "convs": 1}, init="random", weight_mse=0.0,
         weight_l1=0.8, weight_dssim=0.2, weight_lpips=0.0, weight_nb=0.0, weight_knn=0.0, weight_delta=0.0,
         deferred=False,
     )  # fmt: skip
@@ -120,4 +120,4 @@ def test_l1_and_dssim_are_those_of_the_whole_picture_whatever_the_window_and_the
 def test_without_any_weight_of_colour_training_is_refused(scene) -> None:
     meshes, _ = read_sequence(scene["meshes"])
     with pytest.raises(ConfigError, match=r"weight_mse.*one above 0"):
-        create_method(meshes, {}, [], TrainConfig(weight_mse=0.0, init="random"))
+        create_method(meshes, {}, [], train_config(weight_mse=0.0, init="random"))

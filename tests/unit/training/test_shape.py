@@ -1,19 +1,18 @@
 """Smooth offsets: what they span, that they follow the gradient of mu, and that the paper's training has none."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
-from nbavatar.config.avatar import RatesConfig
 from nbavatar.errors import DataError
 from nbavatar.mesh.frames import face_frames
 from nbavatar.mesh.topology import vertex_components
 from nbavatar.methods.billboards.initial import initial_avatar
 from nbavatar.methods.billboards.offsets import SmoothOffsets, _components, offset_basis
+from nbavatar.methods.billboards.options import RatesConfig
 from nbavatar.optimization.adam import Adam
 from tests.scenes.toy import OCTAHEDRON, OCTAHEDRON_FACES, TETRAHEDRON, TETRAHEDRON_FACES, sequence
+from tests.scenes.training import train_config
 from tests.unit.training.test_loop import CONFIG, run, same
 
 REST = np.concatenate([OCTAHEDRON, TETRAHEDRON]).astype(np.float32)
@@ -69,7 +68,7 @@ def test_a_step_moves_all_billboards_along_their_normals_by_the_rate(made) -> No
 
 def test_training_with_offsets_resumes_bit_for_bit_and_differs_from_the_papers(scene, tmp_path) -> None:
     assert RatesConfig().offset == 0.0
-    config = replace(CONFIG, rates=replace(CONFIG.rates, offset=1e-3))
+    config = train_config(CONFIG, rates={"offset": 1e-3})
     whole, _ = run(scene, config, tmp_path / "whole")
     steps = iter(range(100))
     run(scene, config, tmp_path / "cut", should_stop=lambda: next(steps) == 5)

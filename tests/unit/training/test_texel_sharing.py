@@ -1,7 +1,5 @@
 """Gradients that a billboard's texels share."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -11,6 +9,7 @@ from hypothesis import strategies as st
 from nbavatar.methods.billboards.initial import initial_avatar
 from nbavatar.methods.billboards.training import BillboardTraining, shared_gradient
 from tests.scenes.toy import sequence
+from tests.scenes.training import train_config
 from tests.unit.training.test_loop import CONFIG
 
 
@@ -29,7 +28,7 @@ def test_training_hands_it_to_both_textures_of_the_billboard_that_is_seen(share:
     meshes = sequence()
     coords = {name: part.rest for name, part in meshes.parts.items()}
     avatar = initial_avatar(meshes, coords, meshes.frames, CONFIG)
-    BillboardTraining(avatar, None, replace(CONFIG, texel_sharing=share))
+    BillboardTraining(avatar, None, train_config(CONFIG, texel_sharing=share))
     for textures in (avatar.billboards.features, avatar.billboards.alpha_logit):
         textures[1, 0, 0].sum().backward()
         assert textures.grad is not None

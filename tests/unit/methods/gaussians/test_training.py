@@ -7,22 +7,21 @@ import numpy as np
 import pytest
 import torch
 
-from nbavatar.config.avatar import TrainConfig
-from nbavatar.config.baselines import (
-    DensityConfig,
-    GaussianAvatarsConfig,
-    GaussianAvatarsRates,
+from nbavatar.config.core import to_mapping
+from nbavatar.config.training import TrainConfig
+from nbavatar.data.sequences import MeshSequence, Part, read_sequence
+from nbavatar.data.views import ViewStore, views_of
+from nbavatar.io.framepack import FramePack
+from nbavatar.methods.create import create_method
+from nbavatar.methods.gaussian_avatars.options import GaussianAvatarsConfig, GaussianAvatarsRates
+from nbavatar.methods.gaussians.avatar import GaussianAvatar
+from nbavatar.methods.gaussians.density import densify, remove, reset_opacity
+from nbavatar.methods.gaussians.options import DensityConfig
+from nbavatar.methods.splatting_avatar.options import (
     SplattingAvatarConfig,
     SplattingAvatarRates,
     SplattingDensityConfig,
 )
-from nbavatar.config.core import to_mapping
-from nbavatar.data.sequences import MeshSequence, Part, read_sequence
-from nbavatar.data.views import ViewStore, views_of
-from nbavatar.io.framepack import FramePack
-from nbavatar.methods.base import create_method
-from nbavatar.methods.gaussians.avatar import GaussianAvatar
-from nbavatar.methods.gaussians.density import densify, remove, reset_opacity
 from nbavatar.methods.storage import load_avatar, save_avatar
 from nbavatar.optimization.adam import Adam
 from nbavatar.training.loop import train
@@ -38,7 +37,7 @@ DENSE = {
     "reset_floor_steps": 15,
     "max_gaussians": 400,
 }
-CONFIG = TrainConfig(steps=40, previews=0, checkpoint_seconds=0.0, prefetch=2, weight_lpips=0.0)
+CONFIG = TrainConfig(steps=40, previews=0, checkpoint_seconds=0.0, prefetch=2)
 GAUSSIAN_AVATARS = replace(
     CONFIG,
     method="gaussian_avatars",

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from nbavatar.config.avatar import TrainConfig, UNetConfig
 from nbavatar.data.sequences import MeshSequence, Part
 from nbavatar.data.views import View
 from nbavatar.errors import DataError
@@ -16,6 +15,7 @@ from nbavatar.methods.billboards.compression.prune import prune, seen_billboards
 from nbavatar.methods.billboards.initial import initial_avatar
 from nbavatar.methods.storage import load_avatar, save_avatar
 from tests.scenes.toy import OCTAHEDRON, OCTAHEDRON_FACES, camera
+from tests.scenes.training import train_config
 
 SIZE = 48
 CENTRES = [torch.zeros(3), torch.tensor([0.1, -0.2, 0.3])]
@@ -31,9 +31,9 @@ def nested():
     rest = (np.concatenate(shells) @ turn.T).astype(np.float32)
     faces = np.concatenate([OCTAHEDRON_FACES + shell * len(OCTAHEDRON) for shell in range(5)])
     sequence = MeshSequence(["f0"], {"head": Part(faces, rest, rest[None])}, {})
-    config = TrainConfig(
+    config = train_config(
         texels=4, init="random", extent_margin=1.2, alpha_floor=0.97, alpha_peak=0.975,
-        unet=UNetConfig(width=4, depth=3, max_width=8, convs=1),
+        unet={"width": 4, "depth": 3, "max_width": 8, "convs": 1},
     )  # fmt: skip
     avatar = initial_avatar(sequence, {}, ["f0"], config).eval()
     K = torch.tensor([[1.9 * SIZE, 0, 0.5 * SIZE], [0, 1.9 * SIZE, 0.5 * SIZE], [0, 0, 1]])

@@ -1,15 +1,10 @@
-"""Options of training and timing an avatar. Defaults are the paper's; where it is silent, DESIGN.md says why."""
+"""Options of the paper's method. Defaults are the paper's."""
 
 from dataclasses import dataclass
 
-from nbavatar.config.baselines import GaussianAvatarsConfig, SplattingAvatarConfig
 from nbavatar.config.core import option
 
-__all__ = ["RatesConfig", "RefineConfig", "SpeedConfig", "TrainConfig", "UNetConfig"]
-
-_PARTS = ("head", "right_hand", "left_hand")
-_PRECISIONS = ("fp32", "bf16", "fp16")
-_METHODS = ("billboards", "gaussian_avatars", "splatting_avatar")
+__all__ = ["BillboardsConfig", "RatesConfig", "RefineConfig", "UNetConfig"]
 
 
 @dataclass(frozen=True)
@@ -52,11 +47,9 @@ class RefineConfig:
 
 
 @dataclass(frozen=True)
-class TrainConfig:
-    """Training of one avatar."""
+class BillboardsConfig:
+    """Neural billboards and their U-Net (the paper's method)."""
 
-    method: str = option("billboards", "What is trained: the paper's billboards, or a baseline.", choices=_METHODS)
-    parts: list[str] | None = option(None, "Parts to model; all that the meshes have by default.", choices=_PARTS)
     channels: int = option(6, "Feature channels C of the neural textures.", min=1, max=64)
     texels: int = option(16, "Texels a side T of every texture.", min=1, max=64)
     deferred: bool = option(True, "Decode features by the U-Net; false: billboards hold RGB (ablation 'w/o DNR').")
@@ -68,7 +61,6 @@ class TrainConfig:
     alpha_floor: float = option(0.005, "Smallest initial opacity.", min=1e-9, max=0.999999)
     neighbours: int = option(3, "K of the neighbour regulariser.", min=1)
     include_self: bool = option(True, "A billboard is its own first neighbour (as in GART and HAHA).")
-
     weight_mse: float = option(1.0, "Weight of the squared error of colours (the paper's term).", min=0)
     weight_l1: float = option(0.0, "Weight of the absolute error of colours; not part of the paper.", min=0)
     weight_dssim: float = option(
@@ -79,33 +71,12 @@ class TrainConfig:
     weight_knn: float = option(0.1, "Weight of the neighbour regulariser, lambda_KNN.", min=0)
     weight_delta: float = option(0.001, "Weight of the offsets, lambda_Delta.", min=0)
     dice: str = option("milletari", "Form of the Dice loss.", choices=("milletari", "haha"))
-    lpips_net: str = option("alex", "Backbone of the training LPIPS.", choices=("alex", "vgg"))
-    lpips_every: int = option(1, "LPIPS in every n-th step only, n times as heavy (it is dear on a CPU).", min=1)
-    lpips_from: float = option(0.0, "Share of training without LPIPS at the start.", min=0, max=1)
-    lpips_full_until: float = option(0.1, "Share of training with LPIPS on the whole image, then crops.", min=0, max=1)
-    lpips_crop: int = option(256, "Side of the random LPIPS crops [px].", min=32)
-
-    schedule: str = option(
-        "fast", "fast: coarse to fine with a final decay; paper: 400,000 plain steps.", choices=("fast", "paper")
-    )
-    steps: int | None = option(None, "Optimization steps; 40,000 (fast) or 400,000 (paper) by default.", min=1)
-    max_minutes: float | None = option(
-        None, "Time budget instead of steps; the schedule follows the clock [min].", min=0
-    )
-    coarse_until: list[float] = option(
-        [0.1, 0.35], "Fast: shares of training after which the resolution doubles, up to full.", min=0, max=1
-    )
-    coarse_side: int = option(64, "Fast: no stage is coarser than this [px].", min=16)
-    final_rate: float = option(0.05, "Fast: factor on all rates at the end (cosine).", min=0, max=1)
-    decay_from: float = option(0.4, "Fast: share of training at which that decay starts.", min=0, max=1)
     rates: RatesConfig = option(RatesConfig, "Learning rates.")
     texel_sharing: float = option(
         0.0, "Texels also take the mean gradient of their billboard, so many times; 0 for none, as in the paper.", min=0
     )
-    rate_factor: float = option(1.0, "Factor on every learning rate.", min=0)
     clip: float = option(0.0, "Largest gradient norm of the renderer; 0 = no clipping.", min=0)
     refine: RefineConfig = option(RefineConfig, "Compensation of fitting errors.")
-
     roi: bool = option(True, "Decode only a window around the avatar.")
     roi_margin: float = option(0.15, "Margin of that window, in its own size (hair has no mesh).", min=0)
     order: str = option("ray", "Compositing order of the rasterizer: ray, kbuffer(n) or center.")
@@ -124,21 +95,3 @@ class TrainConfig:
         min=0.01,
         max=64,
     )
-    max_bad_steps: int = option(20, "Non-finite steps in a row before training stops.", min=1)
-    previews: int = option(6, "Preview pictures over the whole training.", min=0)
-    checkpoint_seconds: float = option(60.0, "Time between checkpoints [s].", min=0)
-    gaussian_avatars: GaussianAvatarsConfig = option(GaussianAvatarsConfig, "The baseline GaussianAvatars.")
-    splatting_avatar: SplattingAvatarConfig = option(SplattingAvatarConfig, "The baseline SplattingAvatar.")
-    cache_mb: int = option(2048, "Memory for decoded training frames [MB].", min=0)
-    prefetch: int = option(4, "Frames decoded ahead.", min=0)
-    seed: int = option(0, "Seed of all random numbers.", min=0)
-
-
-@dataclass(frozen=True)
-class SpeedConfig:
-    """Timing of a trained avatar."""
-
-    frames: int = option(8, "Different frames that are timed.", min=1)
-    repeats: int = option(20, "Timed passes over each stage.", min=1)
-    warmup: int = option(3, "Passes before timing starts.", min=0)
-    precisions: list[str] = option(["fp32", "bf16"], "Arithmetics of the U-Net to time.", choices=_PRECISIONS)
