@@ -92,7 +92,7 @@ def test_train_learns_the_toy_scene(scene, tmp_path) -> None:
 def test_parameter_groups_have_the_rates_of_the_supplement(scene) -> None:
     meshes, _ = read_sequence(scene["meshes"])
     for deferred in (True, False):
-        config = replace(CONFIG, init="random", deferred=deferred)
+        config = train_config(CONFIG, init="random", deferred=deferred)
         avatar = initial_avatar(meshes, {}, [], config)
         rates = {group["name"]: group["lr"] for group in parameter_groups(avatar, config)}
         decays = {group["name"]: group["final"] for group in parameter_groups(avatar, config) if "final" in group}
