@@ -24,7 +24,7 @@ from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import CropConfig
 from nbavatar.data.sequences import read_sequence
 from nbavatar.errors import ConfigError, DataError
-from nbavatar.io.framepack import UNSEEN, FramePack, FramePackWriter
+from nbavatar.io.framepack import FramePack, FramePackWriter, mark_unseen
 from nbavatar.preprocess.crop import Window, resize_area, resize_labels
 from nbavatar.preprocess.cropping import crop_extent, frame_boxes, plan_crop
 from nbavatar.preprocess.foreground import estimate_foreground
@@ -85,7 +85,7 @@ def main(args: argparse.Namespace) -> None:
                 rgb = window.cut(pack.read("rgb", frame))
                 rgb = resize_area(rgb, plan.size)
                 label, alpha = resize_labels(label, alpha, plan.size)
-                label[unseen], alpha[unseen] = UNSEEN, 0
+                mark_unseen(label, alpha, unseen)
                 out.add("rgb", frame, estimate_foreground(rgb, alpha) if cfg.edge_color else rgb)
                 out.add("label", frame, label)
                 out.add("alpha", frame, alpha)

@@ -20,7 +20,7 @@ from torch import Tensor
 from nbavatar.camera.pinhole import project
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
-from nbavatar.io.framepack import UNSEEN, FramePack
+from nbavatar.io.framepack import FramePack, unseen_in
 
 __all__ = ["Sample", "View", "ViewStore", "ViewStream", "check_views", "shuffled", "views_of"]
 
@@ -226,7 +226,8 @@ class ViewStore:
                 raise DataError.of(pack.path, f"{layer}/{view.frame}", expected=expected, found=found)
         ignored = np.zeros_like(alpha)
         if "label" in pack.layers and (self._excluded or pack.manifest.get("unseen")):
-            ignored[np.isin(pack.read("label", view.frame), [*self._excluded, UNSEEN])] = 255
+            label = pack.read("label", view.frame)
+            ignored[np.isin(label, self._excluded) | unseen_in(label)] = 255
             alpha = np.where(ignored > 0, 0, alpha).astype(np.uint8)
         self.decoded += 1
         used = (alpha > 0) | (ignored > 0)

@@ -33,13 +33,28 @@ from nbavatar.io.images import decode_image, encode_png
 from nbavatar.io.records import canonical_json
 from nbavatar.names import check_name
 
-__all__ = ["FORMAT", "UNSEEN", "FramePack", "FramePackWriter"]
+__all__ = ["FORMAT", "FramePack", "FramePackWriter", "mark_unseen", "unseen_in"]
 
 FORMAT = 1
-UNSEEN = 255
+_UNSEEN = 255
 _MANIFEST = "manifest.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _REQUIRED = ("stage", "subject", "camera", "width", "height", "cam_from_world", "frames", "layers")
+
+
+def mark_unseen(label: np.ndarray, alpha: np.ndarray, unseen: np.ndarray) -> None:
+    """Marks, in place, pixels of which the camera's image says nothing: label 255, no coverage.
+
+    Args:
+        label, alpha: uint8 `[H, W]`.
+        unseen: bool `[H, W]`.
+    """
+    label[unseen], alpha[unseen] = _UNSEEN, 0
+
+
+def unseen_in(label: np.ndarray) -> np.ndarray:
+    """Pixels that `mark_unseen` has marked in labels, bool of their shape."""
+    return label == _UNSEEN
 
 
 class FramePackWriter:
@@ -138,7 +153,7 @@ class FramePack:
 
     def unseen(self, frame: str) -> np.ndarray | None:
         """Pixels of which the camera's image says nothing, bool `[H, W]`; None where there are none in any frame."""
-        return self.read("label", frame) == UNSEEN if self.manifest.get("unseen") else None
+        return unseen_in(self.read("label", frame)) if self.manifest.get("unseen") else None
 
     def intrinsics(self, frame: str) -> np.ndarray:
         """Camera matrix of one frame, float64 `[3, 3]` [px], of the images in this pack."""

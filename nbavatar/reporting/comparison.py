@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nbavatar.io.framepack import UNSEEN, FramePack
+from nbavatar.io.framepack import FramePack, unseen_in
 from nbavatar.preprocess.crop import blank_unseen
 from nbavatar.reporting.insets import contact_pixels, contact_window, cut
 from nbavatar.reporting.page import Card, Strip
@@ -131,7 +131,7 @@ def compare_frame(name: str, group: Sequence[Rendered], crops: Sequence[FramePac
     if crop is not None:
         alpha = crop.read("alpha", frame)
         label = crop.read("label", frame) if "label" in crop.layers else None
-        unseen = None if label is None else label == UNSEEN
+        unseen = None if label is None else unseen_in(label)
         truth = _composite(crop.read("rgb", frame), alpha, group[0].background)
         window = contact_window(label, alpha)
         picture = np.round(truth * 255).astype(np.uint8)
