@@ -10,7 +10,7 @@ is compressed already; PNG, because it is lossless and everything opens it.
     label   0 background, 1 head, 2 right, 3 left hand   uint8 [H, W]
     alpha   coverage of the labelled parts, 255 = full   uint8 [H, W]
 
-In a crop that sticks out of the camera's image, what lies outside has the label `UNSEEN`, and the manifest tells by
+In a crop that sticks out of the camera's image, what lies outside has the label 255, and the manifest tells by
 `unseen` whether there is any.
 """
 

@@ -6,7 +6,7 @@ import torch
 
 from nbavatar.data.views import ViewStore, ViewStream, check_views, shuffled, views_of
 from nbavatar.errors import DataError
-from nbavatar.io.framepack import UNSEEN, FramePack, FramePackWriter
+from nbavatar.io.framepack import FramePack, FramePackWriter
 from tests.scenes.toy import FRAMES, SIZE, sequence, write_scene
 
 PARTS = ["head", "right_hand"]
@@ -60,7 +60,7 @@ def test_sample_marks_what_the_camera_did_not_see(packs, tmp_path) -> None:
     with FramePackWriter(tmp_path / "out.zip", {**pack.manifest, "unseen": True}) as out:
         for frame in pack.frames:
             label, alpha = pack.read("label", frame).copy(), pack.read("alpha", frame).copy()
-            label[:, 20:], alpha[:, 20:] = UNSEEN, 0
+            label[:, 20:], alpha[:, 20:] = 255, 0
             for layer, image in (("rgb", pack.read("rgb", frame)), ("label", label), ("alpha", alpha)):
                 out.add(layer, frame, image)
     with FramePack(tmp_path / "out.zip") as cut:

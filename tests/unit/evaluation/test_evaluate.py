@@ -11,7 +11,7 @@ from skimage.metrics import structural_similarity
 
 from nbavatar.cli import main
 from nbavatar.evaluation.evaluate import composite, mean_images
-from nbavatar.io.framepack import UNSEEN, FramePack, FramePackWriter
+from nbavatar.io.framepack import FramePack, FramePackWriter
 
 SIZE = 40
 FRAMES = ["0001", "0002", "0003"]
@@ -46,7 +46,7 @@ def write_crop(path, camera, seed, unseen=None):
             if unseen is not None:
                 alpha[:, unseen] = 0
                 label = np.where(alpha > 0, np.uint8(1), np.uint8(0))
-                label[:, unseen] = UNSEEN
+                label[:, unseen] = 255
                 pack.add("label", frame, label)
             pack.add("rgb", frame, image(seed + i))
             pack.add("alpha", frame, alpha)
