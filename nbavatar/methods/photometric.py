@@ -9,9 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from nbavatar.metrics.ssim import C1, C2, SIGMA, WINDOW
+__all__ = ["WINDOW", "loss_dssim", "loss_l1", "loss_mse"]
 
-__all__ = ["loss_dssim", "loss_l1", "loss_mse"]
+WINDOW = 11
+"""Side of the window of D-SSIM [px]."""
+
+# Stated here, not taken from the metric, whose edits must not train again.
+_SIGMA, _C1, _C2 = 1.5, 0.01**2, 0.03**2
 
 
 def loss_mse(image: Tensor, target: Tensor, *, pixels: int | None = None) -> Tensor:
@@ -59,8 +63,8 @@ def loss_dssim(image: Tensor, target: Tensor, *, pixels: int | None = None) -> T
     mean_x, mean_y, square_x, square_y, product = blurred
     covariance = product - mean_x * mean_y
     variances = (square_x - mean_x.square()) + (square_y - mean_y.square())
-    ssim = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
-    ssim = ssim / ((mean_x.square() + mean_y.square() + C1) * (variances + C2))
+    ssim = (2 * mean_x * mean_y + _C1) * (2 * covariance + _C2)
+    ssim = ssim / ((mean_x.square() + mean_y.square() + _C1) * (variances + _C2))
     return (1.0 - ssim).sum() / (channels * (pixels or height * width))
 
 
@@ -75,5 +79,5 @@ def _blur(planes: Tensor) -> Tensor:
 @functools.cache
 def _taps(dtype: torch.dtype, device: torch.device) -> Tensor:
     offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
-    taps = torch.exp(-offsets.square() / (2 * SIGMA**2))
+    taps = torch.exp(-offsets.square() / (2 * _SIGMA**2))
     return (taps / taps.sum()).to(dtype=dtype, device=device).view(1, 1, WINDOW)

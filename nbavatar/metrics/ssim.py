@@ -23,12 +23,12 @@ from torch import Tensor
 from nbavatar.errors import DataError
 from nbavatar.metrics.psnr import check_images
 
-__all__ = ["C1", "C2", "SIGMA", "WINDOW", "ssim", "ssim_map"]
+__all__ = ["SIGMA", "WINDOW", "ssim", "ssim_map"]
 
 WINDOW = 11
 SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
+_C1 = 0.01**2
+_C2 = 0.03**2
 
 
 def ssim_map(x: Tensor, y: Tensor) -> Tensor:
@@ -53,8 +53,8 @@ def ssim_map(x: Tensor, y: Tensor) -> Tensor:
         mean_a, mean_b, square_a, square_b, product = _blur(torch.stack((a, b, a * a, b * b, a * b)))
         luminance = mean_a * mean_b
         energy = mean_a.square() + mean_b.square()
-        numerator = (2 * luminance + C1) * (2 * (product - luminance) + C2)
-        denominator = (energy + C1) * (square_a + square_b - energy + C2)
+        numerator = (2 * luminance + _C1) * (2 * (product - luminance) + _C2)
+        denominator = (energy + _C1) * (square_a + square_b - energy + _C2)
         total = total + numerator / denominator
     return total / x.shape[1]
 

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from nbavatar.data.views import Sample
-from nbavatar.methods.photometric import loss_dssim, loss_l1, loss_mse
-from nbavatar.metrics.ssim import WINDOW
+from nbavatar.methods.photometric import WINDOW, loss_dssim, loss_l1, loss_mse
 
 __all__ = ["Pair", "compare"]
 
