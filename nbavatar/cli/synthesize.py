@@ -3,7 +3,8 @@
 Everything a reader of the release needs is written below --out: body models and index files in `assets/`, and for
 each subject videos and mask videos (mp4) of every camera, keypoints with confidence, boxes, contacts, deformations,
 parameters, cameras and cuts, in `train/` or `test/` as in the release (S1, S3, S6 in `test/`). Lengths are metres,
-angles radians, pixels those of the full, distorted frame.
+angles radians, pixels those of the full, distorted frame. With {"layout": "capture"} each subject is a capture of its
+own instead, in --out/SUBJECT: images of pinhole cameras, exact masks, meshes with a tracker's error.
 
 The people are made from MakeHuman's CC0 base mesh; the dents under the fingers come from a biharmonic displacement
 field, not from the simulation of `nbavatar deform`, so they can serve as a reference for it. The same options and
@@ -13,6 +14,8 @@ examples:
   nbavatar synthesize --out resources/SyntheticDecaf
   nbavatar synthesize --out /tmp/tiny --cfg '{"mesh": "tiny", "subjects": ["S2"], "width": 128, "height": 72,
   "frames": 14}'
+  nbavatar synthesize --out /tmp/captures --cfg '{"layout": "capture", "hair": "ponytail", "subjects": ["S2"],
+  "width": 512, "height": 512, "focal": 2.3, "frames": 24}'
 """
 
 import argparse

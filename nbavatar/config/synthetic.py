@@ -22,7 +22,15 @@ SUBJECTS = ("S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8")
 
 @dataclasses.dataclass(frozen=True)
 class SynthesizeConfig:
-    """A complete synthetic dataset in the layout of the Decaf release, body models included."""
+    """Synthetic subjects: a complete dataset in the layout of the Decaf release, body models included, or captures."""
+
+    layout: str = option(
+        "decaf", "Layout of the Decaf release, or one capture a subject (pinholes, exact masks, meshes).",
+        choices=("decaf", "capture"),
+    )  # fmt: skip
+    hair: str = option(
+        "cap", "Hair: on the scalp only, or with a ponytail, which no mesh has.", choices=("cap", "ponytail")
+    )
 
     subjects: tuple[str, ...] = option(("S1", "S2", "S3", "S4"), "Subjects to make.", choices=SUBJECTS)
     cameras: tuple[str, ...] = option(CAMERAS, "Cameras to render.", choices=CAMERAS)
@@ -41,6 +49,10 @@ class SynthesizeConfig:
     parameter_noise: float = option(
         0.0, "Error of the stored parameters, in multiples of 1 mm and 0.5 degrees.", min=0.0, max=20.0
     )
+    mesh_noise: float = option(
+        1.0, "Captures: error of the meshes, a rigid motion a part and frame, in multiples of 1 mm and 0.3 degrees.",
+        min=0.0, max=20.0,
+    )  # fmt: skip
     codec: str = option("mp4v", "FourCC code of the videos.")
     seed: int = option(0, "Seed of everything random.", min=0)
 

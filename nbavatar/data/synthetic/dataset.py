@@ -17,6 +17,7 @@ import numpy as np
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import Camera, project
 from nbavatar.config.synthetic import RECORD, refuse_others
+from nbavatar.data.synthetic.capture import write_capture
 from nbavatar.data.synthetic.figure import build_figure, pose_figure
 from nbavatar.data.synthetic.legacy_pickle import dump_array, dump_legacy
 from nbavatar.data.synthetic.models import Human, flame_content, landmark_content, mano_content, mirrored_mano_content
@@ -48,9 +49,12 @@ def write_dataset(
     height: int,
     supersample: int = 2,
     mesh: str = "full",
+    layout: str = "decaf",
+    hair: str = "cap",
     focal: float = 2.9,
     distortion: float = 1.0,
     press: float = 6e-3,
+    mesh_noise: float = 1.0,
     keypoint_noise: float = 1.5,
     missing: float = 0.03,
     parameter_noise: float = 0.0,
@@ -70,9 +74,12 @@ def write_dataset(
         width, height: image size [px], even numbers.
         supersample: samples a pixel along each side.
         mesh: "full" or "tiny".
+        layout: "decaf", or "capture" for one capture a subject, `root/<subject>` (`synthetic.capture`).
+        hair: "cap" or "ponytail".
         focal: focal length over image height.
         distortion: factor on the lens distortion.
         press: how deep the hand reaches into the undeformed face [m].
+        mesh_noise: error of a capture's meshes, multiples of 1 mm and 0.3 degrees.
         keypoint_noise: standard deviation of keypoints [px of 1080 lines].
         missing: share of keypoints and boxes that are missing.
         parameter_noise: error of the stored parameters, multiples of 1 mm and 0.5 degrees.
@@ -94,7 +101,8 @@ def write_dataset(
     about = {"subjects": list(subjects), "cameras": list(cameras), "mesh": mesh, **(record or {})}
     write_json(root / RECORD, about | {"complete": False})
     bodies = build_bodies(mesh)
-    write_assets(root, bodies.human)
+    if layout == "decaf":
+        write_assets(root, bodies.human)
     for name in subjects:
         scene = make_scene(
             bodies,
@@ -104,11 +112,27 @@ def write_dataset(
             press=press,
             progress=lambda items, name=name: progress(items, f"{name} motion", frames),
         )
-        rig = make_cameras(cameras, width, height, focal=focal, distortion=distortion, seed=seed)
+        bent = distortion if layout == "decaf" else 0.0
+        rig = make_cameras(cameras, width, height, focal=focal, distortion=bent, seed=seed)
+        if layout == "capture":
+            write_capture(
+                root / name,
+                scene,
+                rig,
+                hair=hair,
+                supersample=supersample,
+                mesh_noise=mesh_noise,
+                seed=seed,
+                workers=workers,
+                progress=progress,
+                record=record,
+            )
+            continue
         write_subject(
             root,
             scene,
             rig,
+            hair=hair,
             supersample=supersample,
             keypoint_noise=keypoint_noise * height / 1080,
             missing=missing,
@@ -140,6 +164,7 @@ def write_subject(
     scene: Scene,
     cameras: dict[str, Camera],
     *,
+    hair: str = "cap",
     supersample: int,
     keypoint_noise: float,
     missing: float,
@@ -213,7 +238,7 @@ def write_subject(
             keys, boxes = detect(camera, points, verts, seen, noise=keypoint_noise, missing=missing)
             _save(base / f"{part}_keys" / name / f"{camera_name}.npy", keys)
             _save(base / f"{part}_bbs" / name / f"{camera_name}.npy", boxes)
-    _write_videos(base, scene, cameras, supersample, codec, seed, workers, progress)
+    _write_videos(base, scene, cameras, hair, supersample, codec, seed, workers, progress)
 
 
 def detect(
@@ -267,6 +292,7 @@ def _write_videos(
     base: Path,
     scene: Scene,
     cameras: dict[str, Camera],
+    hair: str,
     supersample: int,
     codec: str,
     seed: int,
@@ -276,7 +302,7 @@ def _write_videos(
     """Renders frame by frame, all cameras at once, so that a frame's shadow maps are made once."""
     from concurrent.futures import ThreadPoolExecutor
 
-    name, figure = scene.subject.name, build_figure(scene)
+    name, figure = scene.subject.name, build_figure(scene, hair)
     lenses = [lens_of(camera, supersample) for camera in cameras.values()]
     resolution = int(np.clip(lenses[0].camera.height, 256, 1024))
     paths = [(base / "videos" / name / f"{c}.mp4", base / "segmentations" / name / f"{c}.mp4") for c in cameras]

@@ -1,10 +1,14 @@
-"""What the cameras see of a subject besides the two models: hair, clothed torso, arm; and the looks of all of it."""
+"""What the cameras see of a subject besides the two models: hair, clothed torso, arm; and the looks of all of it.
+
+Hair is a layer on the scalp; with the style `ponytail` there is also some that stands off the head (`synthetic.hair`).
+"""
 
 import dataclasses
 
 import numpy as np
 
 from nbavatar.data.synthetic.contact import vertex_normals
+from nbavatar.data.synthetic.hair import ponytail
 from nbavatar.data.synthetic.models import EYE_ORIGIN, Human, hand_axes
 from nbavatar.data.synthetic.motion import Subject
 from nbavatar.data.synthetic.scene import STAGE_TO_WORLD, Scene
@@ -31,10 +35,11 @@ class Figure:
     """Everything about the drawn mesh that does not change over time.
 
     Attributes:
-        faces (F, 3), material (F,): head, hand, hair, torso, arm in this order.
+        faces (F, 3), material (F,): head, hand, hair, torso, arm, hair off the head in this order.
         rest (V, 3): texture coordinates [mm]; dorsal (V,).
-        counts: vertices of the five pieces.
+        counts: vertices of the six pieces.
         hair_ids: head vertices under each hair vertex; hair_lift (H,) [m].
+        tail: hair off the head, in the axes of the head's template, (T, 3) [m]; there may be none.
     """
 
     faces: np.ndarray
@@ -47,6 +52,14 @@ class Figure:
     torso: np.ndarray
     shoulder: np.ndarray
     looks: Looks
+    tail: np.ndarray
+
+    def piece(self, number: int) -> tuple[slice, np.ndarray]:
+        """Vertices of a piece, and its faces, (F, 3) from its first vertex on."""
+        start = int(sum(self.counts[:number]))
+        part = slice(start, start + self.counts[number])
+        rows = ((self.faces >= part.start) & (self.faces < part.stop)).all(1)
+        return part, self.faces[rows] - start
 
 
 def _linear(colour: tuple[float, float, float]) -> np.ndarray:
@@ -91,8 +104,8 @@ def looks_of(human: Human, subject: Subject) -> Looks:
     return Looks(colours, lips, brow, (centres - EYE_ORIGIN) * 1e3, np.array(nails), knuckles, float(subject.seed % 97))
 
 
-def build_figure(scene: Scene) -> Figure:
-    """Collects the drawn mesh of one subject."""
+def build_figure(scene: Scene, hair: str = "cap") -> Figure:
+    """Collects the drawn mesh of one subject, with hair of a style: cap or ponytail."""
     human, subject = scene.bodies.human, scene.subject
     q = (human.head - EYE_ORIGIN) * 1e3
     skin = human.part_sizes[0]
@@ -116,8 +129,9 @@ def build_figure(scene: Scene) -> Figure:
             arm_faces += [[a, b, a + _ARM_SIDES], [b, b + _ARM_SIDES, a + _ARM_SIDES]]
     arm_faces = np.array(arm_faces)
     sleeve = (arm_faces.min(1) // _ARM_SIDES) < _ARM_RINGS * 6 // 10
-    pieces = [human.head_faces, human.hand_faces, renumber[scalp], human.torso_faces, arm_faces]
-    counts = (len(q), len(human.hand), len(ids), len(torso), _ARM_RINGS * _ARM_SIDES)
+    tail, tail_faces = ponytail() if hair == "ponytail" else (np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    pieces = [human.head_faces, human.hand_faces, renumber[scalp], human.torso_faces, arm_faces, tail_faces]
+    counts = (len(q), len(human.hand), len(ids), len(torso), _ARM_RINGS * _ARM_SIDES, len(tail))
     start = np.concatenate([[0], np.cumsum(counts)[:-1]])
     faces = np.concatenate([f + s for f, s in zip(pieces, start, strict=True)])
     material = np.concatenate(
@@ -127,15 +141,18 @@ def build_figure(scene: Scene) -> Figure:
             np.full(len(scalp), HAIR),
             np.full(len(torso[human.torso_faces]), CLOTH),
             np.where(sleeve, CLOTH, ARM),
+            np.full(len(tail_faces), HAIR),
         ]
     )
     ring, side = np.divmod(np.arange(counts[4]), _ARM_SIDES)
     angle = 2 * np.pi * side / _ARM_SIDES
     arm_rest = np.stack([40 * np.cos(angle), ring * 22.0, 40 * np.sin(angle)], 1)
-    rest = np.concatenate([q, human.hand * 1e3, q[ids], torso * 1e3, arm_rest])
+    rest = np.concatenate([q, human.hand * 1e3, q[ids], torso * 1e3, arm_rest, tail * 1e3])
     dorsal = np.zeros(len(rest))
     dorsal[counts[0] : counts[0] + counts[1]] = vertex_normals(human.hand, human.hand_faces)[:, 1]
-    return Figure(faces, material, rest, dorsal, counts, ids, lift, torso, human.shoulder, looks_of(human, subject))
+    looks = looks_of(human, subject)
+    tail = tail + EYE_ORIGIN
+    return Figure(faces, material, rest, dorsal, counts, ids, lift, torso, human.shoulder, looks, tail)
 
 
 def pose_figure(figure: Figure, scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -152,14 +169,14 @@ def pose_figure(figure: Figure, scene: Scene, n: int) -> tuple[np.ndarray, np.nd
     torso = figure.torso @ STAGE_TO_WORLD[:3, :3].T + STAGE_TO_WORLD[:3, 3]
     inside = figure.shoulder + np.array([0.035, -0.012, 0.0])  # the sleeve starts within the torso
     shoulder = inside @ STAGE_TO_WORLD[:3, :3].T + STAGE_TO_WORLD[:3, 3]
-    verts = np.concatenate([head, hand, hair, torso, _arm(scene, n, shoulder)])
+    tail = figure.tail @ scene.rotation[n].T + scene.shift[n]
+    verts = np.concatenate([head, hand, hair, torso, _arm(scene, n, shoulder), tail])
     start = np.concatenate([[0], np.cumsum(figure.counts)])
     normals = np.zeros_like(verts)
     normals[: start[1]], normals[start[1] : start[2]] = head_normals, hand_normals
-    for piece in range(2, 5):
-        rows = (figure.faces >= start[piece]).all(1) & (figure.faces < start[piece + 1]).all(1)
-        part = slice(start[piece], start[piece + 1])
-        normals[part] = vertex_normals(verts[part], figure.faces[rows] - start[piece])
+    for piece in range(2, len(figure.counts)):
+        part, faces = figure.piece(piece)
+        normals[part] = vertex_normals(verts[part], faces)
     return verts, normals, _ambient(verts, normals, start)
 
 

@@ -53,6 +53,7 @@ class Scene:
         contact_head (N, V), contact_hand (N, P): bool.
         parameters: name -> (N, k) arrays under the dataset's names, prefixed `head.` or `right_hand.`.
         residual (N,): deepest penetration that is left [m].
+        rotation (N, 3, 3), shift (N, 3): rigid motion from the axes of the head's template to the world.
     """
 
     bodies: Bodies
@@ -68,6 +69,8 @@ class Scene:
     contact_hand: np.ndarray
     parameters: dict[str, np.ndarray]
     residual: np.ndarray
+    rotation: np.ndarray
+    shift: np.ndarray
 
     @property
     def head(self) -> np.ndarray:
@@ -206,6 +209,8 @@ def make_scene(
         contact_hand,
         parameters,
         residual,
+        rotation,
+        transl + centre - np.einsum("nij,nj->ni", rotation, centre),
     )
 
 
