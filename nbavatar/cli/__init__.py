@@ -31,6 +31,7 @@ VERBS = {
     "detect": "keypoints of face and hands in images, for captures that bring none",
     "fit": "multi-view refit of head and hand models",
     "align": "rigid alignment of a capture's meshes to its pictures",
+    "shell": "what the head's mesh lacks (hair), carved from the training masks",
     "spectral": "spectral coordinates of the meshes",
     "deform": "contact deformation of the head by the hand, cached to NPZ and EXR",
     "train": "train an avatar",

@@ -39,7 +39,7 @@ import numpy as np
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.geometry import DeformConfig
-from nbavatar.data.sequences import MeshSequence, Part, read_sequence, write_sequence
+from nbavatar.data.sequences import PARTS, MeshSequence, Part, read_sequence, write_sequence
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.arrays import read_arrays, write_arrays
 from nbavatar.io.atomic import atomic_write
@@ -87,7 +87,7 @@ def main(args: argparse.Namespace) -> None:
     sequence, _ = read_sequence(args.meshes)
     for name, part in sequence.parts.items():
         validate_mesh(part.rest, part.faces, f"{args.meshes}: {name}.rest")
-    hands = [name for name in sequence.parts if name != "head"]
+    hands = [name for name in sequence.parts if name in PARTS[1:]]
     record = run_record("deform", config=to_mapping(cfg), inputs={"meshes": args.meshes})
     state = None
     if "head" in sequence.parts and hands and sequence.frames:
@@ -197,7 +197,7 @@ def _ticks(count: int) -> Iterator[int]:
 
 def _assemble(sequence: MeshSequence, hands: list[str], arrays: dict[str, np.ndarray], bed: np.ndarray) -> MeshSequence:
     head = sequence.parts["head"]
-    parts = {"head": Part(head.faces, head.rest, arrays["head"])}
+    parts = {**sequence.parts, "head": Part(head.faces, head.rest, arrays["head"])}
     moved = ("contact.", "deformation.")
     extras = {f"reference.{k}" if k.startswith(moved) else k: v for k, v in sequence.extras.items()}
     extras |= {"head_rigid": head.verts, "contact.head": arrays["contact.head"], "stiffness.head": bed}

@@ -8,15 +8,17 @@
               see it); target: it stays where it is [m]
     --out     mesh sequence (.npz): the target's frames, the source's rest shapes and cameras
 
-Hands are shifted so that they touch the source's head where they touched the target's (see --free-hands). Contact that
-is deeper than the skin is the work of `nbavatar deform --meshes OUT`. Frames of the result are nobody's training
-frames: no refinement of training frames is applied to them.
+A shell (`nbavatar shell`) rides on the head in its new poses. Hands are shifted so that they touch the source's head
+where they touched the target's (see --free-hands). Contact that is deeper than the skin is the work of `nbavatar
+deform --meshes OUT`. Frames of the result are nobody's training frames: no refinement of training frames is applied
+to them.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
-from nbavatar.data.sequences import MeshSequence, read_sequence, write_sequence
+from nbavatar.data.sequences import SHELL, MeshSequence, read_sequence, write_sequence
 from nbavatar.errors import DataError
 from nbavatar.provenance import run_record
 
@@ -39,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Runs `nbavatar reenact`."""
     from nbavatar.evaluation.reenact import check_topology, drive, has_parameters
+    from nbavatar.fitting.shell import carried
 
     source, _ = read_sequence(args.source)
     target, _ = read_sequence(args.target)
@@ -50,6 +53,9 @@ def main(args: argparse.Namespace) -> int:
     by_parameters = args.by == "parameters" or (args.by == "auto" and known and args.assets is not None)
     bodies, files = _bodies(Path(args.assets or ""), parts, source) if by_parameters else (None, {})
     driven = drive(source, target, parts, bodies=bodies, place=args.place, keep_contact=not args.free_hands)
+    if SHELL in source.parts and "head" in driven.parts:
+        shell = carried(source.parts[SHELL], source.parts["head"], driven.parts["head"].verts)
+        driven = replace(driven, parts={**driven.parts, SHELL: shell})
     how = "parameters" if by_parameters else "deformation transfer"
     config = {"by": how, "place": args.place, "keep_contact": not args.free_hands}
     inputs = {"source": args.source, "target": args.target, **files}

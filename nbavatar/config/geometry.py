@@ -5,7 +5,7 @@ from typing import Any
 
 from nbavatar.config.core import option, to_mapping
 
-__all__ = ["AlignConfig", "DeformConfig", "FitConfig", "SpectralConfig"]
+__all__ = ["AlignConfig", "DeformConfig", "FitConfig", "ShellConfig", "SpectralConfig"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +71,36 @@ class AlignConfig:
     block: int = option(32, "Most frames that are aligned together; bounds the memory.", min=2)
     lines: int = option(512, "Height to which larger pictures are reduced [px].", min=16, max=2160)
     points: int = option(4000, "Most vertices of a part that are looked at.", min=3)
+
+
+@dataclasses.dataclass(frozen=True)
+class ShellConfig:
+    """What the head's mesh lacks (hair), as a surface of its own. Lengths in radii of the head: the root mean square
+    distance of its surface from its middle, about 0.1 m."""
+
+    reach: float = option(
+        0.0, "How far beyond the mesh a piece must reach to be modelled; 0 leaves the stage out [radius].", min=0.0
+    )
+    gap: float = option(0.1, "What is nearer to the mesh than this is left to the mesh [radius].", min=0.0, max=10.0)
+    misses: float = option(
+        0.02, "Share of the views of a point in which it may lie outside the part's mask, for the error of poses.",
+        min=0.0, max=0.5,
+    )  # fmt: skip
+    support: float = option(
+        0.05, "Share of the views of a point in which the mesh must be out of reach of what is seen there.",
+        min=0.0, max=1.0,
+    )  # fmt: skip
+    spread_deg: float = option(
+        40.0, "Views whose directions differ by less than this tell no depth: nothing is carved [degrees].",
+        min=0.0, max=180.0,
+    )  # fmt: skip
+    margin: float = option(2.0, "How far around the mesh hair is looked for [radius].", min=0.1, max=10.0)
+    voxel: float = option(0.03, "Side of a cell, unless more than `cells` were needed [radius].", min=1.0e-3, max=1.0)
+    cells: int = option(2_000_000, "Most cells; bounds memory and time.", min=1000, max=200_000_000)
+    views: int = option(240, "Most views that are looked at, spread over cameras and frames.", min=1)
+    lines: int = option(512, "Height to which larger masks are reduced [px].", min=16, max=2160)
+    faces: int = option(2000, "Most faces of the surface; fewer where they would be smaller than the mesh's.", min=8)
+    picture_size: int = option(320, "Side of one view in the picture [px].", min=64, max=4096)
 
 
 @dataclasses.dataclass(frozen=True)

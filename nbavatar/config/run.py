@@ -16,7 +16,7 @@ from nbavatar.config.evaluation import (
     TableConfig,
     VideoConfig,
 )
-from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, SpectralConfig
+from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, ShellConfig, SpectralConfig
 from nbavatar.config.preprocess import CheckConfig, CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
 from nbavatar.config.training import TrainConfig, own_options
@@ -38,6 +38,7 @@ class Stages:
     masks: MasksConfig = option(MasksConfig, "Head and hand masks.")
     fit: FitConfig = option(FitConfig, "Multi-view refit.")
     align: AlignConfig = option(AlignConfig, "Rigid alignment of a capture's meshes to its pictures.")
+    shell: ShellConfig = option(ShellConfig, "What the head's mesh of a capture lacks, such as hair.")
     spectral: SpectralConfig = option(SpectralConfig, "Spectral coordinates.")
     deform: DeformConfig = option(DeformConfig, "Contact deformation.")
     train: TrainConfig = option(TrainConfig, "Training.")
@@ -58,6 +59,9 @@ class Variant:
         "Meshes that carry it: with contact deformation, as refitted (a capture's: as aligned), or as delivered.",
         choices=("deform", "fit", "tracks"),
     )  # fmt: skip
+    shell: bool = option(
+        True, "Whether it has the shell, where a capture has one (`stages.shell`); delivered meshes never have."
+    )
     stages: dict[str, Any] = option({}, "Options that differ from the run's `stages`, by stage.")
 
 

@@ -9,7 +9,7 @@ from nbavatar.methods.registry import METHODS, options_class
 
 __all__ = ["TrainConfig", "own_options"]
 
-_PARTS = ("head", "right_hand", "left_hand")
+_PARTS = ("head", "right_hand", "left_hand", "shell")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,8 @@ One `.npz` per subject:
     <part>.rest       float32 [V, 3] [m]  the subject's shape, canonical and undeformed
     <part>.verts      float32 [N, V, 3] [m]  world
 
-Parts are `head`, `right_hand`, `left_hand`, in this order; whatever a scene lacks is absent. All other
+Parts are `head`, `right_hand`, `left_hand`, in this order, then `shell`: what the head's mesh lacks (`nbavatar shell`),
+which rides with the head and has the head's label in masks. Whatever a scene lacks is absent. All other
 arrays are extras of the stage that wrote them, named `<what>.<part>...`.
 """
 
@@ -22,9 +23,15 @@ from nbavatar.errors import DataError
 from nbavatar.io.arrays import read_arrays, write_arrays
 from nbavatar.names import check_name
 
-__all__ = ["PARTS", "MeshSequence", "Part", "read_sequence", "write_sequence"]
+__all__ = ["PARTS", "SHELL", "MeshSequence", "Part", "read_sequence", "write_sequence"]
 
 PARTS = ("head", "right_hand", "left_hand")
+"""Parts that have a label in masks, 1, 2 and 3."""
+
+SHELL = "shell"
+"""Part without a label of its own: it belongs to the head."""
+
+_ALL = (*PARTS, SHELL)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,13 +79,13 @@ class MeshSequence:
 def write_sequence(path: str | os.PathLike[str], sequence: MeshSequence, record: Mapping[str, Any]) -> None:
     """Writes a sequence; see the module for the layout. Refuses shapes that disagree."""
     arrays: dict[str, np.ndarray] = {"frames": np.array(sequence.frames, dtype=np.str_)}
-    for name in PARTS:
+    for name in _ALL:
         if name in sequence.parts:
             part = sequence.parts[name]
             arrays[f"{name}.faces"] = np.asarray(part.faces, dtype=np.int64)
             arrays[f"{name}.rest"] = np.asarray(part.rest, dtype=np.float32)
             arrays[f"{name}.verts"] = np.asarray(part.verts, dtype=np.float32)
-    unknown = set(sequence.parts) - set(PARTS)
+    unknown = set(sequence.parts) - set(_ALL)
     clash = set(arrays) & set(sequence.extras)
     if unknown or clash:
         raise ValueError(f"unknown parts {sorted(unknown)}, extras that clash {sorted(clash)}")
@@ -98,10 +105,10 @@ def read_sequence(path: str | os.PathLike[str]) -> tuple[MeshSequence, dict[str,
     _check(str(path), arrays)
     parts = {
         name: Part(arrays[f"{name}.faces"], arrays[f"{name}.rest"], arrays[f"{name}.verts"])
-        for name in PARTS
+        for name in _ALL
         if f"{name}.verts" in arrays
     }
-    core = {"frames"} | {f"{name}.{key}" for name in PARTS for key in ("faces", "rest", "verts")}
+    core = {"frames"} | {f"{name}.{key}" for name in _ALL for key in ("faces", "rest", "verts")}
     extras = {name: value for name, value in arrays.items() if name not in core}
     frames = [check_name(str(frame), path, "frames", error=DataError) for frame in arrays["frames"]]
     return MeshSequence(frames, parts, extras), record
@@ -113,7 +120,7 @@ def _check(path: str, arrays: Mapping[str, np.ndarray]) -> None:
         raise DataError.of(path, "frames", expected="frame ids, text [N]", found=_kind(names))
     if len(np.unique(names)) != len(names):
         raise DataError.of(path, "frames", expected="each frame once", found="one twice")
-    present = [name for name in PARTS if f"{name}.verts" in arrays]
+    present = [name for name in _ALL if f"{name}.verts" in arrays]
     if not present:
         raise DataError.of(path, expected=f"at least one part of {', '.join(PARTS)}", found="none")
     for name in present:

@@ -17,7 +17,7 @@ import numpy as np
 
 from nbavatar.bodymodels.flame import Flame
 from nbavatar.bodymodels.mano import Mano
-from nbavatar.data.sequences import MeshSequence, Part
+from nbavatar.data.sequences import SHELL, MeshSequence, Part
 from nbavatar.errors import DataError
 from nbavatar.evaluation.transfer import DeformationTransfer
 
@@ -36,12 +36,12 @@ def has_parameters(sequence: MeshSequence, parts: Sequence[str]) -> bool:
 
 
 def check_topology(source: MeshSequence, target: MeshSequence, source_name: str, target_name: str) -> list[str]:
-    """The parts that both have, after making sure that their faces agree.
+    """The parts that both have, after making sure that their faces agree; a shell is each subject's own.
 
     Raises:
         DataError: no part in common, or a part with other faces or another number of vertices.
     """
-    common = [part for part in source.parts if part in target.parts]
+    common = [part for part in source.parts if part in target.parts and part != SHELL]
     if not common:
         raise DataError.of(
             target_name, expected=f"one of the parts {', '.join(source.parts)}", found=", ".join(target.parts)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nbavatar.data.sequences import MeshSequence
+from nbavatar.data.sequences import PARTS, MeshSequence
 from nbavatar.mesh.drawing import draw_mesh, vertex_normals
 from nbavatar.reporting.pictures import RAMP
 
@@ -85,7 +85,7 @@ def dent_pictures(
     hands = [
         (part.verts[row].astype(np.float64), part.faces)
         for name, part in sequence.parts.items()
-        if name != "head" and np.isfinite(part.verts[row]).all()
+        if name in PARTS[1:] and np.isfinite(part.verts[row]).all()
     ]
     share = np.clip(1000 * np.linalg.norm(after - before, axis=1) / largest_mm, 0, 1)
     anchors, table = np.linspace(0, 1, len(RAMP)), np.asarray(RAMP) / 255

@@ -278,20 +278,22 @@ def _added(name):
 
 
 MASKED = {**CHECKED, "masks": 1, "crop": 1}
+# What the head lacks is carved from the training cameras' masks.
+CARVED = {**MASKED, "shell": 1, "spectral": 1}
 SEEN = {**CHECKED, "ingest": 1, "masks": 1, "crop": 1}
-MOVED = {**CHECKED, "tracks": 1, "masks": 3, "crop": 3, "align": 1, "spectral": 1, **TRAINED}
+MOVED = {**CHECKED, "tracks": 1, "masks": 3, "crop": 3, "align": 1, "shell": 1, "spectral": 1, **TRAINED}
 EDITS = {
     "nothing but a copy": (lambda root: None, {}),
-    "a mask": (_edited("masks/c0/f1.png"), MASKED | TRAINED),
+    "a mask": (_edited("masks/c0/f1.png"), CARVED | TRAINED),
     "a mask of the held-out camera": (_edited("masks/c1/f1.png"), MASKED | HELD_OUT),
-    "a mask replaced": (_replaced("masks/c2/f3.png"), MASKED | TRAINED),
-    "a mask removed": (lambda root: (root / "masks/c0/f2.png").unlink(), MASKED | TRAINED),
-    "coverage added": (_added("alpha/c0/f0.png"), MASKED | TRAINED),
-    "an image": (_edited("images/c0/f1.png"), SEEN | {"align": 1, "spectral": 1} | TRAINED),
+    "a mask replaced": (_replaced("masks/c2/f3.png"), CARVED | TRAINED),
+    "a mask removed": (lambda root: (root / "masks/c0/f2.png").unlink(), CARVED | TRAINED),
+    "coverage added": (_added("alpha/c0/f0.png"), CARVED | TRAINED),
+    "an image": (_edited("images/c0/f1.png"), SEEN | {"align": 1, "shell": 1, "spectral": 1} | TRAINED),
     "an image of the held-out camera": (_edited("images/c1/f0.png"), SEEN | HELD_OUT),
     "an image renamed": (
         lambda root: (root / "images/c2/f0.png").rename(root / "images/c2/f0.PNG"),
-        SEEN | {"align": 1, "spectral": 1} | TRAINED,
+        SEEN | {"align": 1, "shell": 1, "spectral": 1} | TRAINED,
     ),
     "a mesh": (_edited("meshes/f2.npz"), MOVED),
     "a mesh replaced": (_replaced("meshes/f0.npz"), MOVED),
@@ -319,7 +321,7 @@ def test_files_that_exchange_their_names_are_seen(captured):
     captured.run()
     assert captured.plan() == {}
     _exchanged("masks/c0", "f0.png", "f1.png")(captured.root)
-    assert captured.plan() == MASKED | TRAINED
+    assert captured.plan() == CARVED | TRAINED
     for path, content, time in kept:
         path.write_bytes(content)
         os.utime(path, ns=(0, time))
@@ -354,9 +356,13 @@ def test_supplied_masks_run_what_depends_on_them(tmp_path):
         _added(name)(own)
     words = [f"stages={{masks: {{supplied: {own}}}}}"]
     capture = Capture(tmp_path, *words)
-    for name, expected in (("toy/c0/f1.png", TRAINED), ("toy/c1/f0.png", HELD_OUT), ("c2/f0.png", TRAINED)):
+    for name, expected in (
+        ("toy/c0/f1.png", CARVED | TRAINED),
+        ("toy/c1/f0.png", MASKED | HELD_OUT),
+        ("c2/f0.png", CARVED | TRAINED),
+    ):
         (own / name).write_bytes(b"mended")
-        assert capture.plan() == MASKED | expected, name
+        assert capture.plan() == expected, name
         capture.run()
     (own / "toy/c2.mp4").write_bytes(b"film")  # comes before c2/
     assert capture.plan() == MASKED | TRAINED

@@ -84,6 +84,9 @@ R = f"results/{RUN.run}"
 # A capture brings meshes: nothing is refitted, but they may be aligned to its pictures.
 ALIGNED = RUN.layout == "capture" and RUN.stages.align.iterations > 0
 
+# What they lack is carved from the masks of the training cameras.
+SHELLED = RUN.layout == "capture" and RUN.stages.shell.reach > 0
+
 
 def one_of(names):
     """Regular expression that matches exactly these names."""
@@ -316,12 +319,21 @@ def meshes_for(subject, variant):
     stage = RUN.variants[variant].meshes
     if stage == "deform" and RUN.layout == "capture":
         stage = "fit" if RUN.stages.tracks.contact == "given" else stage
+    if stage == "fit" and SHELLED and RUN.variants[variant].shell:
+        return f"{R}/shell/{subject}.npz"
     return fitted_of(subject) if stage == "fit" else f"{R}/{stage}/{subject}.npz"
 
 
 def fitted(wildcards):
     """Meshes before contact: refitted ones, or those that a capture brings, aligned or not."""
     return fitted_of(wildcards.subject)
+
+
+def whole(wildcards):
+    """The same with all parts that a variant may have."""
+    if SHELLED:
+        return f"{R}/shell/{wildcards.subject}.npz"
+    return fitted(wildcards)
 
 
 def fitted_of(subject):
@@ -397,6 +409,8 @@ def report_pictures():
     )
     if RUN.layout == "capture" and RUN.stages.tracks.contact == "given":
         stages = ("spectral",)
+    if SHELLED:
+        stages = ("shell", *stages)
     subjects = list(dict.fromkeys(row.subject for row in ROWS))
     return [
         *(f"{R}/figures/{figure}.png" for figure in FIGURES),

@@ -1,7 +1,8 @@
-"""Refit or alignment, spectral coordinates, contact deformation.
+"""Refit or alignment, what the meshes lack, spectral coordinates, contact deformation.
 
 REQUIRED INPUTS: results/{run}/tracks/{subject}.npz, results/{run}/ingest/{subject}/*.zip
 OUTPUTS: results/{run}/fit/{subject}.{npz,png} or results/{run}/align/{subject}.npz,
+         results/{run}/shell/{subject}.{npz,png},
          results/{run}/spectral/{subject}.npz, results/{run}/deform/{subject}.{npz,exr.zip}
 """
 
@@ -71,9 +72,42 @@ if ALIGNED:
             " --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
+if SHELLED:
+
+    rule shell:
+        input:
+            meshes=fitted,
+            masks=lambda w: [
+                f"{R}/masks/{w.subject}/{c}.zip"
+                for c in SUBJECTS[w.subject].train_cameras
+            ],
+        output:
+            meshes="results/{run}/shell/{subject}.npz",
+            picture=report(
+                "results/{run}/shell/{subject}.png",
+                category="Geometry",
+                labels={"stage": "shell", "subject": "{subject}"},
+                caption="../report/shell.rst",
+            ),
+        log:
+            "logs/{run}/shell/{subject}.log",
+        benchmark:
+            "benchmarks/{run}/shell/{subject}.jsonl"
+        priority: 10
+        resources:
+            mem="4GB",
+            runtime="1h",
+        params:
+            cfg=options("shell"),
+            code=code_digest("shell"),
+        shell:
+            "nbavatar shell --meshes {input.meshes:q} --masks {input.masks:q} --out {output.meshes:q}"
+            " --picture {output.picture:q} --cfg {params.cfg:q} > {log:q} 2>&1"
+
+
 rule spectral:
     input:
-        fitted,
+        whole,
     output:
         meshes="results/{run}/spectral/{subject}.npz",
         picture=report(
@@ -98,7 +132,7 @@ rule spectral:
 
 rule deform:
     input:
-        fitted,
+        whole,
     output:
         meshes="results/{run}/deform/{subject}.npz",
         maps="results/{run}/deform/{subject}.exr.zip",

@@ -29,6 +29,8 @@ def stage_files(stage):
         files["check"] = looked_at(subjects)
     if ALIGNED:
         files["align"] = [f"{R}/align/{s}.npz" for s in subjects]
+    if SHELLED:
+        files["shell"] = [f"{R}/shell/{s}.npz" for s in subjects]
     return files[stage]
 
 
@@ -60,6 +62,7 @@ for _stage in (
     "crop",
     *(["fit"] if RUN.layout == "decaf" else []),
     *(["align"] if ALIGNED else []),
+    *(["shell"] if SHELLED else []),
     "spectral",
     "deform",
     "train",

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nbavatar.config.geometry import DeformConfig
-from nbavatar.data.sequences import MeshSequence
+from nbavatar.data.sequences import PARTS, MeshSequence
 from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.physics.collision import measure_overlap
 from nbavatar.physics.contact import ContactNumbers, ContactSolver, FrameResult
@@ -56,7 +56,7 @@ class ContactScene(NamedTuple):
 
 def contact_scene(sequence: MeshSequence, count: int) -> ContactScene | None:
     """The scene of a sequence, with at most `count` frames of each kind; None where no hand ever touches a head."""
-    hands = [name for name in sequence.parts if name != "head"]
+    hands = [name for name in sequence.parts if name in PARTS[1:]]
     if "head" not in sequence.parts or not hands:
         return None
     depth = _depths(sequence, hands)
