@@ -10,7 +10,7 @@ and writes
   in
              the head's rest frame [m], and in the world in every frame in which the head is [m]. Without, the sequence
              is as it came. The record says which, and why.
-  --picture  the head with the shell from four sides, and the views in which it is least explained by the mesh
+  --picture  the head with the shell from four sides
 
 All that is found is relative to the head's size; nothing depends on the unit of length. The head's pixels behind
 another part, and what lies outside an image, are no evidence.
@@ -63,7 +63,7 @@ def main(args: argparse.Namespace) -> None:
     if _HEAD in sequence.parts and cfg.reach > 0:
         with contextlib.ExitStack() as stack:
             packs = [stack.enter_context(FramePack(path)) for path in args.masks]
-            shell, rest = _carved(sequence, packs, args.meshes, cfg)
+            shell, rest = _carved(sequence, packs, cfg)
     elif cfg.reach <= 0:
         shell.said["absent"] = "reach is 0"
     result = sequence
@@ -87,14 +87,14 @@ def main(args: argparse.Namespace) -> None:
         print(f"shell of {len(shell.faces)} faces, {mean:.1f} mm off the mesh in the mean and up to {most:.1f} mm")
 
 
-def _carved(sequence: MeshSequence, packs: list[FramePack], meshes: str, cfg: ShellConfig) -> tuple[Shell, Rest]:
+def _carved(sequence: MeshSequence, packs: list[FramePack], cfg: ShellConfig) -> tuple[Shell, Rest]:
     """The shell, and the head's motion."""
     head = sequence.parts[_HEAD]
     there = np.isfinite(head.verts).all((1, 2))
     views: list[tuple[int, int]] = []
     cameras = []
     for index, pack in enumerate(packs):
-        cameras.append(_camera(pack, sequence, meshes))
+        cameras.append(_camera(pack))
         rows = [row for row in sequence.index(pack.split("train")) if there[row]]
         share = max(1, cfg.views // len(packs))
         few = np.unique(np.linspace(0, len(rows) - 1, min(share, len(rows))).round().astype(int)) if rows else []
@@ -127,8 +127,8 @@ def _carved(sequence: MeshSequence, packs: list[FramePack], meshes: str, cfg: Sh
     return shell, rest
 
 
-def _camera(pack: FramePack, sequence: MeshSequence, meshes: str) -> Camera:
-    """The camera of a pack, by the pack's own account; its distortion by the sequence's where the pack has none."""
+def _camera(pack: FramePack) -> Camera:
+    """The camera of a pack, as its pictures were recorded."""
     name = str(pack.manifest["camera"])
     given: Any = pack.manifest.get("distortion")
     bent = None if given is None or not np.any(given) else checked_coefficients(given, f"{pack.path}: {name}")

@@ -13,9 +13,12 @@ from nbavatar.bodymodels.flame import Flame
 from nbavatar.bodymodels.mano import Mano, shorten_tips
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import project
+from nbavatar.cli import main
 from nbavatar.config.synthetic import CAMERAS, RECORD, refuse_others
+from nbavatar.data.capture import open_capture, read_mesh, read_topology
 from nbavatar.data.synthetic.dataset import write_dataset
 from nbavatar.errors import ConfigError, DataError
+from nbavatar.io.images import decode_image
 from nbavatar.io.pickles import read_pickle
 from nbavatar.io.video import probe_video, read_video
 from nbavatar.math.rotations import axis_angle_to_matrix
@@ -241,3 +244,20 @@ def test_a_dataset_is_known_as_synthetic_before_it_is_whole(root):
         write_dataset(root.parent / "half", subjects=("S2",), **OPTIONS, codec="none!")
     assert json.loads((root.parent / "half" / RECORD).read_text())["complete"] is False
     refuse_others(root.parent / "half")
+
+
+def test_a_subject_as_a_capture_passes_its_check_and_its_ponytail_is_in_no_mesh(tmp_path: Path) -> None:
+    options = {"layout": "capture", "hair": "ponytail", "width": 96, "height": 96, "focal": 2.3, "frames": 4}
+    options |= {"cameras": ["084", "108", "122"], "mesh": "tiny", "subjects": ["S2"], "supersample": 2}
+    assert main(["synthesize", "--out", str(tmp_path), "--cfg", json.dumps(options)]) == 0
+    root = tmp_path / "S2"
+    assert main(["check", str(root)]) == 0
+    capture = open_capture(root)
+    camera, mesh = capture.camera("122"), read_mesh(capture, "00000", read_topology(root))
+    label = decode_image(root / "masks/122/00000.png")
+    alpha = decode_image(root / "alpha/122/00000.png")
+    assert np.array_equal(label > 0, alpha >= 128)
+    head = project(mesh["head"].astype(np.float64), camera.K, camera.cam_from_world)[0]
+    x = np.flatnonzero((label == 1).any(0))
+    assert x.max() > head[:, 0].max() + 8  # the ponytail, a tenth of the picture beyond the head
+    assert abs(x.min() - head[:, 0].min()) < 5
