@@ -1,15 +1,13 @@
 """What the head's mesh lacks and the masks show (hair), carved from the training masks and added as a part of its own.
 
 Reads
-  --meshes   mesh sequence (.npz, `nbavatar align` or `tracks`) with camera.<camera>.{K, cam_from_world, distortion,
-  size}
+  --meshes   mesh sequence (.npz, `nbavatar align` or `tracks`)
   --masks    frame packs (.zip, `nbavatar masks`) of the training cameras, layers label and alpha, as recorded; only
              frames of the split `train` are looked at
 and writes
   --out      the mesh sequence, with the part `shell` where something reaches beyond the head's mesh: faces, positions
-  in
-             the head's rest frame [m], and in the world in every frame in which the head is [m]. Without, the sequence
-             is as it came. The record says which, and why.
+             in the head's rest frame [m], and in the world in every frame in which the head is [m]. Without, the
+             sequence is as it came. The record says which, and why.
   --picture  the head with the shell from four sides
 
 All that is found is relative to the head's size; nothing depends on the unit of length. The head's pixels behind

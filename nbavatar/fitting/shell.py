@@ -145,7 +145,7 @@ def carve_shell(
         if not found.kept.any():
             return Shell(*nothing, {**said, "absent": "nothing reaches beyond the mesh"})
         box = np.argwhere(found.kept)
-        low, high = grid.low + (box.min(0) - 2) * grid.edge, grid.low + (box.max(0) + 3) * grid.edge
+        low, high = grid.low + (box.min(0) - 3) * grid.edge, grid.low + (box.max(0) + 4) * grid.edge
     gap, least = cfg.gap * rest.radius, (cfg.reach * rest.radius) ** 2
     verts, shell = piece_surface(grid, found.depth, found.kept, mesh, gap, least)
     if not len(shell):
