@@ -12,12 +12,12 @@ import numpy as np
 from nbavatar.camera.distortion import undistortion_map
 from nbavatar.camera.pinhole import Camera, scale_intrinsics
 from nbavatar.fitting.hull import BACKGROUND, NOTHING, PART, UNEXPLAINED
-from nbavatar.io.framepack import UNSEEN
 from nbavatar.mesh.zbuffer import rasterize_mesh
 
 __all__ = ["Lens", "evidence_of"]
 
 _COVERED = 128  # coverage from which a pixel shows the part [1/255]
+_OUTSIDE = 254  # stands where the lens took no picture: neither background nor a part, like a pixel without truth
 _RIM = 0.005  # rim of other parts that says nothing, as a share of the picture's height
 
 
@@ -70,7 +70,7 @@ def evidence_of(
     """
     import cv2
 
-    seen, coverage = lens.take(label, UNSEEN), lens.take(alpha, 0)
+    seen, coverage = lens.take(label, _OUTSIDE), lens.take(alpha, 0)
     result = np.where((seen == own) & (coverage >= _COVERED), PART, BACKGROUND).astype(np.uint8)
     drawn = np.ones((lens.height, lens.width), np.uint8)
     for verts, faces in meshes.values():
