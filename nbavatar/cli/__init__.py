@@ -38,6 +38,7 @@ VERBS = {
     "render": "render an avatar under a protocol",
     "evaluate": "PSNR, SSIM and LPIPS of stored renders",
     "speed": "time rasterization and neural rendering of an avatar",
+    "collect": "all numbers of a run as one tidy table for pandas",
     "table": "one table of the paper, printed and reproduced values side by side",
     "protocol-sensitivity": "how the figures of one render move with the protocol",
     "figure": "one figure for print: comparisons, features, cross-reenactment, contact, curves, Pareto fronts",

@@ -1,6 +1,7 @@
 """Results of other verbs, read for tables, figures and reports: each must have its form (`nbavatar.io.forms`)."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,10 @@ from nbavatar.errors import DataError, parsing
 from nbavatar.io.forms import check_form
 from nbavatar.io.records import read_json, read_record
 from nbavatar.names import check_name
+from nbavatar.provenance import file_digest
+from nbavatar.reporting.cells import Source
 
-__all__ = ["read_evaluation", "read_histories", "read_result", "read_sweep", "read_timing"]
+__all__ = ["read_evaluation", "read_histories", "read_results", "read_sweep", "read_timing"]
 
 _SIZE = (Ellipsis, 2, int)
 _VALUES = {str: (float, None)}
@@ -99,17 +102,29 @@ def read_timing(path: str) -> dict[str, Any]:
     return read_record(path, _TIMING)
 
 
-def read_result(path: str) -> dict[str, Any]:
-    """A result of `nbavatar evaluate` or of `nbavatar speed`.
+def read_results(paths: Sequence[str]) -> list[tuple[dict[str, Any], Source]]:
+    """Results of `nbavatar evaluate` and of `nbavatar speed`, each with its source.
+
+    A timing does not say whose it is; its place, `<subject>/<variant>.json`, does.
 
     Raises:
         DataError: missing, or of another form.
     """
-    content = read_json(path)
-    if not isinstance(content, dict) or not {"metrics", "speed"} & set(content):
-        raise DataError.of(path, expected="a result of nbavatar evaluate or speed", found="another JSON file")
-    check_form(content, _CAPTIONED if "metrics" in content else _TIMING, path)
-    return _named(content, path) if "metrics" in content else content
+    results = []
+    for path in paths:
+        content = read_json(path)
+        if not isinstance(content, dict) or not {"metrics", "speed"} & set(content):
+            raise DataError.of(path, expected="a result of nbavatar evaluate or speed", found="another JSON file")
+        check_form(content, _CAPTIONED if "metrics" in content else _TIMING, path)
+        if "metrics" in content:
+            values = {f"{name}?": (float, None) for name in content["metrics"]}
+            check_form(content["per_image"], [values], path, "per_image")
+            _named(content, path)
+        content = {"subject": Path(path).parent.name, "variant": Path(path).stem} | content
+        size = content.get("size") or content.get("speed", {}).get("size")
+        pixels = (int(size[0]), int(size[1])) if size else None
+        results.append((content, Source(path, file_digest(path), content.get("protocol_hash", ""), pixels)))
+    return results
 
 
 def _named(evaluation: dict[str, Any], path: object) -> dict[str, Any]:

@@ -12,24 +12,27 @@ Results of another image size than the paper's, and all of them with --size-labe
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
+
 from nbavatar.cli.common import add_cfg_argument, stage_config
-from nbavatar.cli.results import read_result
+from nbavatar.cli.results import read_results
 from nbavatar.config.core import to_mapping
 from nbavatar.config.evaluation import TableConfig
 from nbavatar.config.tables import choose_table, read_tables
 from nbavatar.errors import parsing
 from nbavatar.io.atomic import atomic_write
 from nbavatar.provenance import file_digest, run_record
-from nbavatar.reporting.cells import Source, Table
+from nbavatar.reporting.cells import Source
 from nbavatar.reporting.formats import to_csv, to_latex, to_markdown
 from nbavatar.reporting.markdown import markdown_to_html
 from nbavatar.reporting.page import page
 from nbavatar.reporting.printed import read_printed
-from nbavatar.reporting.tables import Result, build_table, index_results
+from nbavatar.reporting.tables import build_table
 
-__all__ = ["add_arguments", "main", "read_results"]
+__all__ = ["add_arguments", "main"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,13 +57,13 @@ def main(args: argparse.Namespace) -> int:
         args.table,
         layout,
         _read_printed(args.reported),
-        index_results(read_results(files)),
+        read_results(files),
         printed_source=Source(args.reported, file_digest(args.reported)),
         lpips_net=cfg.lpips_net,
         size_label=args.size_label,
     )
     record = run_record("table", config={"table": args.table} | to_mapping(cfg), inputs=inputs)
-    table = Table(**{**vars(table), "record": record})
+    table = replace(table, record=record)
     texts = {"csv": to_csv(table), "md": to_markdown(table), "tex": to_latex(table)}
     shown = markdown_to_html(texts["md"].partition("\n")[2])  # the page has the title
     texts["html"] = page(table.title, args.size_label, [("table", args.table, shown)])
@@ -71,22 +74,6 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def read_results(paths: list[str]) -> list[Result]:
-    """Reads evaluations and timings, each with its source.
-
-    A timing does not say whose it is; its place, ``<subject>/<variant>.json``, does.
-    """
-    results = []
-    for path in paths:
-        content = read_result(path)
-        content = {"subject": Path(path).parent.name, "variant": Path(path).stem} | content
-        size = content.get("size") or content.get("speed", {}).get("size")
-        pixels = (int(size[0]), int(size[1])) if size else None
-        source = Source(path, file_digest(path), content.get("protocol_hash", ""), pixels)
-        results.append((content, source))
-    return results
-
-
-def _read_printed(path: str) -> dict:
+def _read_printed(path: str) -> pd.DataFrame:
     with parsing(path, "the numbers printed in the paper (.csv)"):
         return read_printed(Path(path).read_text(encoding="utf-8-sig").splitlines(), path)

@@ -3,10 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import pandas as pd
+
 from nbavatar.config.tables import Panel, TableLayout
 from nbavatar.methods.registry import METHODS
 from nbavatar.reporting.cells import COLUMNS, Source, plain
-from nbavatar.reporting.printed import Printed, deviating_marks, deviating_means
+from nbavatar.reporting.printed import deviating_marks, deviating_means
 
 __all__ = ["describe_deviations", "describe_protocol", "describe_speeds", "describe_trainings"]
 
@@ -92,9 +94,7 @@ def describe_trainings(layout: TableLayout, results: Sequence[tuple[Mapping[str,
     return [f"Trained here: {'; '.join(dict.fromkeys(words))}."] if words else []
 
 
-def describe_deviations(
-    layout: TableLayout, panel: Panel, printed: Mapping[tuple[str, str, str], Printed]
-) -> list[str]:
+def describe_deviations(layout: TableLayout, panel: Panel, printed: pd.DataFrame) -> list[str]:
     """Where means and marks that are recomputed from the paper's printed cells differ from what it prints."""
     if layout.kind == "cameras" or not panel.reported:
         return []

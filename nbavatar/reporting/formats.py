@@ -6,19 +6,16 @@ Markdown    **best**, <u>second</u>, missing cells as an em dash
 LaTeX       a snippet to \\input; needs booktabs, graphicx, subcaption and, for shading, xcolor with option table
 """
 
-import csv
-import io
 import json
 import re
+from collections.abc import Iterable, Iterator
 
-from nbavatar.reporting.cells import COLUMNS, Cell, PanelTable, Table, plain
+import pandas as pd
+
+from nbavatar.reporting.cells import COLUMNS, MISSING, PanelTable, Table, plain
 
 __all__ = ["to_csv", "to_latex", "to_markdown"]
 
-_CSV = (
-    "table", "panel", "block", "row", "column", "text", "value", "mark", "comparable", "shown", "source", "digest",
-    "protocol_hash", "size", "note",
-)  # fmt: skip
 # Shrinks what is wider than the line and leaves the rest alone.
 _FIT = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
 _SPECIAL = {
@@ -29,45 +26,34 @@ _SPECIAL = {
 
 def to_csv(table: Table) -> str:
     """Tidy csv, one line a cell, missing cells included."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(_CSV)
-    for panel in table.panels:
-        for block in panel.blocks:
-            for line in block.lines:
-                for column in panel.columns:
-                    cell = line.cells.get(column, Cell(text=""))
-                    writer.writerow(
-                        _csv_row(table, panel, block.kind, line.label, column, cell, block.comparable, True)
-                    )
-        comparable = all(block.comparable for block in panel.blocks)
-        for kind, label, column, cell in panel.unseen:
-            writer.writerow(_csv_row(table, panel, kind, label, column, cell, comparable, False))
-    return stream.getvalue()
+    cells = table.cells
+    columns = {
+        "table": table.name,
+        "panel": [table.panels[panel].title for panel in cells["panel"]],
+        "block": cells["block"],
+        "row": cells["label"].map(plain),
+        **{name: cells[name] for name in ("column", "text", "value", "mark")},
+        **{name: cells[name].map({True: "yes", False: "no"}) for name in ("comparable", "shown")},
+        "source": [";".join(source.path for source in sources) for sources in cells["sources"]],
+        "digest": [";".join(source.digest for source in sources) for sources in cells["sources"]],
+        "protocol_hash": [_each(source.protocol_hash for source in sources) for sources in cells["sources"]],
+        "size": [_each("x".join(map(str, source.size or ())) for source in sources) for sources in cells["sources"]],
+        "note": cells["note"],
+    }
+    return pd.DataFrame(columns).to_csv(index=False, lineterminator="\n")
 
 
-def _csv_row(
-    table: Table, panel: PanelTable, kind: str, label: str, column: str, cell: Cell, comparable: bool, shown: bool
-) -> list[str]:
-    sources = cell.sources
-    sizes = dict.fromkeys(f"{s.size[0]}x{s.size[1]}" for s in sources if s.size)
-    return [
-        table.name,
-        panel.title,
-        kind,
-        plain(label),
-        column,
-        cell.text,
-        "" if cell.value is None else repr(cell.value),
-        cell.mark,
-        "yes" if comparable else "no",
-        "yes" if shown else "no",
-        ";".join(source.path for source in sources),
-        ";".join(source.digest for source in sources),
-        ";".join(dict.fromkeys(source.protocol_hash for source in sources if source.protocol_hash)),
-        ";".join(sizes),
-        cell.note,
-    ]
+def _each(words: Iterable[str]) -> str:
+    """Each word once, in order, without empty ones."""
+    return ";".join(dict.fromkeys(word for word in words if word))
+
+
+def _shown(table: Table, panel: PanelTable) -> Iterator[tuple[str, list[pd.DataFrame]]]:
+    """Heading and lines of each block of a panel; a line is a frame with one row a column."""
+    number = next(i for i, other in enumerate(table.panels) if other is panel)
+    cells = table.cells[table.cells["shown"] & (table.cells["panel"] == number)]
+    for _, block in cells.groupby("block", sort=False):
+        yield block["heading"].iloc[0], [line for _, line in block.groupby("line", sort=False)]
 
 
 def to_markdown(table: Table) -> str:
@@ -78,11 +64,11 @@ def to_markdown(table: Table) -> str:
             parts += [f"### {panel.title}", ""]
         heads = [table.head, *(_heading(group, key) for group, keys in panel.groups for key in keys)]
         parts += [_md_row(heads), _md_row(["---", *(["---:"] * (len(heads) - 1))])]
-        for block in panel.blocks:
-            parts.append(_md_row([f"*{block.title}*", *([""] * (len(heads) - 1))]))
-            for line in block.lines:
-                cells = [line.cells.get(column, Cell()) for column in panel.columns]
-                parts.append(_md_row([plain(line.label), *(_md_cell(cell) for cell in cells)]))
+        for heading, lines in _shown(table, panel):
+            parts.append(_md_row([f"*{heading}*", *([""] * (len(heads) - 1))]))
+            for line in lines:
+                cells = map(_md_cell, line["text"], line["mark"])
+                parts.append(_md_row([plain(line["label"].iloc[0]), *cells]))
         parts.append("")
     parts += [*(f"- {note}" for note in table.notes), ""]
     sources = [f"- `{_one_line(path)}` {digest}" for path, digest in _sources(table)]
@@ -98,8 +84,9 @@ def _md_row(cells: list[str]) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
-def _md_cell(cell: Cell) -> str:
-    return {"best": f"**{cell.text}**", "second": f"<u>{cell.text}</u>"}.get(cell.mark, cell.text)
+def _md_cell(text: str, mark: str) -> str:
+    text = text or MISSING
+    return {"best": f"**{text}**", "second": f"<u>{text}</u>"}.get(mark, text)
 
 
 def to_latex(table: Table) -> str:
@@ -147,25 +134,23 @@ def _latex_tabular(table: Table, panel: PanelTable) -> list[str]:
     heads = [_escape(table.head), *(_latex_heading(key) for key in panel.columns)]
     lines += [" & ".join(heads) + r" \\", "\\midrule"]
     span = len(panel.columns) + 1
-    for block in panel.blocks:
-        if block is not panel.blocks[0]:
+    for i, (heading, block) in enumerate(_shown(table, panel)):
+        if i > 0:
             lines.append("\\midrule")
-        lines.append(f"\\multicolumn{{{span}}}{{l}}{{\\textit{{{_escape(block.title)}}}}} \\\\")
-        for line in block.lines:
-            if line.rule:
+        lines.append(f"\\multicolumn{{{span}}}{{l}}{{\\textit{{{_escape(heading)}}}}} \\\\")
+        for line in block:
+            if line["rule"].iloc[0]:
                 lines.append(f"\\cmidrule(lr){{1-{span}}}")
-            if line.shaded:
+            if line["shaded"].iloc[0]:
                 lines.append("\\rowcolor{gray!20}")
-            cells = [line.cells.get(column, Cell()) for column in panel.columns]
-            lines.append(" & ".join([_latex_label(line.label), *(_latex_cell(cell) for cell in cells)]) + r" \\")
+            cells = map(_latex_cell, line["text"], line["mark"])
+            lines.append(" & ".join([_latex_label(line["label"].iloc[0]), *cells]) + r" \\")
     return [*lines, "\\bottomrule", "\\end{tabular}"]
 
 
-def _latex_cell(cell: Cell) -> str:
-    text = _escape(cell.text)
-    if re.fullmatch(r"[+-][0-9.]+", cell.text):
-        text = f"${cell.text}$"
-    return {"best": f"\\textbf{{{text}}}", "second": f"\\underline{{{text}}}"}.get(cell.mark, text)
+def _latex_cell(text: str, mark: str) -> str:
+    text = f"${text}$" if re.fullmatch(r"[+-][0-9.]+", text) else _escape(text or MISSING)
+    return {"best": f"\\textbf{{{text}}}", "second": f"\\underline{{{text}}}"}.get(mark, text)
 
 
 def _latex_label(label: str) -> str:
@@ -196,12 +181,5 @@ def _heading(group: str, column: str) -> str:
 
 
 def _sources(table: Table) -> list[tuple[str, str]]:
-    found = {
-        (source.path, source.digest): None
-        for panel in table.panels
-        for block in panel.blocks
-        for line in block.lines
-        for cell in line.cells.values()
-        for source in cell.sources
-    }
-    return list(found)
+    shown = table.cells[table.cells["shown"]]
+    return list(dict.fromkeys((s.path, s.digest) for sources in shown["sources"] for s in sources))

@@ -5,30 +5,22 @@ Values stay text: "0.9711" and "0.976" have different precisions, and both are s
 
 import csv
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from decimal import Decimal
+
+import pandas as pd
 
 from nbavatar.errors import DataError, describe
 from nbavatar.reporting.ranks import rank_marks
 
-__all__ = ["Printed", "deviating_marks", "deviating_means", "read_printed", "recomputed_mean"]
+__all__ = ["deviating_marks", "deviating_means", "read_printed", "recomputed_mean"]
 
 _COLUMNS = ["table", "row", "column", "value", "mark", "note"]
 _NUMBER = re.compile(r"-?[0-9]{1,12}(\.[0-9]{1,12})?")
 _HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False, "fps": True, "ms": False}
 
 
-@dataclass(frozen=True)
-class Printed:
-    """One printed number: its text, how the paper marks it (best, second or nothing), and a remark."""
-
-    text: str
-    mark: str = ""
-    note: str = ""
-
-
-def read_printed(lines: Iterable[str], where: str) -> dict[tuple[str, str, str], Printed]:
+def read_printed(lines: Iterable[str], where: str) -> pd.DataFrame:
     """Reads the sheet of printed numbers.
 
     Args:
@@ -36,7 +28,8 @@ def read_printed(lines: Iterable[str], where: str) -> dict[tuple[str, str, str],
         where: name of the file, for error lines.
 
     Returns:
-        (table, row, column) -> number; columns are named ``<subject>.<metric>`` where there are subjects.
+        One row a number, all text: its table, row and column (``<subject>.<metric>`` where there are subjects), the
+        value as printed, how the paper marks it (best, second or nothing), and a remark.
 
     Raises:
         DataError: another header, an unknown mark, or the same cell twice.
@@ -45,19 +38,20 @@ def read_printed(lines: Iterable[str], where: str) -> dict[tuple[str, str, str],
     if reader.fieldnames != _COLUMNS:
         found = ", ".join(reader.fieldnames or ()) or "nothing"
         raise DataError.of(where, "header", expected=", ".join(_COLUMNS), found=found)
-    cells: dict[tuple[str, str, str], Printed] = {}
+    rows = []
     for row in reader:
         if None in row or any(value is None for value in row.values()):
             raise DataError.of(where, f"line {reader.line_num}", expected=f"{len(_COLUMNS)} columns", found="others")
-        key = (row["table"], row["row"], row["column"])
-        if key in cells:
-            raise DataError.of(where, "/".join(key), expected="each cell once", found="it twice")
+        name = f"{row['table']}/{row['row']}/{row['column']}"
         if row["mark"] not in ("", "best", "second"):
-            raise DataError.of(where, "/".join(key), expected="mark best, second or nothing", found=repr(row["mark"]))
+            raise DataError.of(where, name, expected="mark best, second or nothing", found=repr(row["mark"]))
         if row["column"].rpartition(".")[2] in _HIGHER_IS_BETTER and not _NUMBER.fullmatch(row["value"]):
-            raise DataError.of(where, "/".join(key), expected="a number as printed", found=describe(row["value"]))
-        cells[key] = Printed(row["value"], row["mark"], row["note"] or "")
-    return cells
+            raise DataError.of(where, name, expected="a number as printed", found=describe(row["value"]))
+        rows.append(row)
+    printed = pd.DataFrame(rows, columns=_COLUMNS, dtype=object)
+    for row in printed[printed.duplicated(["table", "row", "column"])].itertuples():
+        raise DataError.of(where, f"{row.table}/{row.row}/{row.column}", expected="each cell once", found="it twice")
+    return printed
 
 
 def recomputed_mean(texts: Sequence[str]) -> Decimal:
@@ -65,50 +59,59 @@ def recomputed_mean(texts: Sequence[str]) -> Decimal:
     return sum((Decimal(text) for text in texts), Decimal(0)) / len(texts)
 
 
-def deviating_means(
-    cells: Mapping[tuple[str, str, str], Printed], table: str, subjects: Sequence[str]
-) -> list[tuple[str, str, str, Decimal]]:
+def _numbers(printed: pd.DataFrame, table: str) -> pd.DataFrame:
+    """The cells of one table that are numbers, with their subject (empty where there is none) and metric."""
+    cells = printed[printed["table"] == table]
+    cells = cells.assign(
+        subject=[column.rpartition(".")[0] for column in cells["column"]],
+        metric=[column.rpartition(".")[2] for column in cells["column"]],
+    )
+    return cells[cells["metric"].isin(list(_HIGHER_IS_BETTER))]
+
+
+def deviating_means(printed: pd.DataFrame, table: str, subjects: Sequence[str]) -> list[tuple[str, str, str, Decimal]]:
     """Printed means that the table's own printed cells do not give.
 
     A mean agrees if it lies within half a unit of its last digit of the exact mean (either way of rounding a half is
     accepted).
 
+    Args:
+        printed: result of ``read_printed``.
+        table: name of the table.
+        subjects: its subjects; a mean is compared where all of them have a printed number.
+
     Returns:
         (row, metric, printed mean, exact mean of the printed cells) of each that does not agree.
     """
+    cells = _numbers(printed, table)
+    parts = cells[cells["subject"].isin(list(subjects))].groupby(["row", "metric"])["value"].agg(list).rename("parts")
+    means = cells[cells["subject"] == "mean"].join(parts, on=["row", "metric"], how="inner").sort_index()
     found = []
-    for (name, row, column), cell in cells.items():
-        subject, _, metric = column.partition(".")
-        if name != table or subject != "mean":
-            continue
-        parts = [cells.get((table, row, f"{s}.{metric}")) for s in subjects]
-        texts = [part.text for part in parts if part is not None]
-        if len(texts) != len(subjects):
-            continue
-        mean = recomputed_mean(texts)
-        half_unit = Decimal(1).scaleb(-len(cell.text.partition(".")[2])) / 2
-        if abs(mean - Decimal(cell.text)) > half_unit:
-            found.append((row, metric, cell.text, mean))
+    for cell in means[means["parts"].map(len) == len(subjects)].itertuples():
+        mean = recomputed_mean(cell.parts)
+        half_unit = Decimal(1).scaleb(-len(cell.value.partition(".")[2])) / 2
+        if abs(mean - Decimal(cell.value)) > half_unit:
+            found.append((cell.row, cell.metric, cell.value, mean))
     return found
 
 
-def deviating_marks(
-    cells: Mapping[tuple[str, str, str], Printed], table: str, *, second: bool
-) -> list[tuple[str, str, str, str]]:
+def deviating_marks(printed: pd.DataFrame, table: str, *, second: bool) -> list[tuple[str, str, str, str]]:
     """Marks of the paper that its own printed cells do not give.
+
+    Args:
+        printed: result of ``read_printed``.
+        table: name of the table.
+        second: whether the table marks the second best too.
 
     Returns:
         (row, column, mark in the paper, mark by the rule of ``rank_marks``); a mark may be empty.
     """
-    columns: dict[str, dict[str, Printed]] = {}
-    for (name, row, column), cell in cells.items():
-        if name == table and column.rpartition(".")[2] in _HIGHER_IS_BETTER:
-            columns.setdefault(column, {})[row] = cell
+    cells = _numbers(printed, table)
     found = []
-    for column, by_row in columns.items():
-        higher = _HIGHER_IS_BETTER[column.rpartition(".")[2]]
-        marks = rank_marks([cell.text for cell in by_row.values()], higher_is_better=higher, second=second)
-        for (row, cell), mark in zip(by_row.items(), marks, strict=True):
-            if cell.mark != mark:
-                found.append((row, column, cell.mark, mark))
+    for column, group in cells.groupby("column", sort=False):
+        higher = _HIGHER_IS_BETTER[group["metric"].iloc[0]]
+        marks = rank_marks(group["value"], higher_is_better=higher, second=second)
+        differs = group["mark"] != marks
+        rows = zip(group["row"][differs], group["mark"][differs], marks[differs], strict=True)
+        found += [(row, column, theirs, ours) for row, theirs, ours in rows]
     return found

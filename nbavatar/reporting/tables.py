@@ -2,64 +2,43 @@
 
 Every table has the paper's rows and columns, up to three times: as printed, as reproduced, and the difference of the
 two (reproduced - printed, of the digits shown). A result whose images are not of the paper's size is shown under a
-heading that says so and is never subtracted from a printed number. Means are recomputed from the cells of the
+heading that says so and is never subtracted from a printed number. Means are recomputed from the numbers of the
 subjects, and are missing unless every subject is there.
+
+All cells of a table are one data frame (``nbavatar.reporting.cells.Table``). Each names the number that it shows by
+subject, variant, protocol and metric; numbers of no single subject, that is means and timings, have the subject ``""``.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
-from typing import Any
+
+import pandas as pd
 
 from nbavatar.config.tables import TIMED, TRAINED, Panel, TableLayout, TableRow
-from nbavatar.errors import DataError
 from nbavatar.reporting.captions import (
     describe_deviations,
     describe_protocol,
     describe_speeds,
     describe_trainings,
 )
-from nbavatar.reporting.cells import COLUMNS, MISSING, Block, Cell, PanelTable, Source, Table, TableLine
-from nbavatar.reporting.printed import Printed
+from nbavatar.reporting.cells import PanelTable, Source, Table, style_of, to_text
 from nbavatar.reporting.ranks import rank_marks
+from nbavatar.reporting.results import Result, tidy_results
 
-__all__ = ["Result", "build_table", "index_results"]
+__all__ = ["build_table"]
 
-Result = tuple[Mapping[str, Any], Source]
-PrintedCells = Mapping[tuple[str, str, str], Printed]
+_NUMBER = ["subject", "variant", "protocol", "metric"]
 _EXTRA = ("psnr_fg", "ssim_fg", "lpips_alex", "lpips_vgg")
-
-
-def index_results(results: Sequence[Result]) -> dict[tuple[str, str, str], Result]:
-    """Evaluations by (subject, variant, protocol), timings by (subject, variant, "").
-
-    Args:
-        results: content and source of each file; each content has its ``subject`` and ``variant``.
-
-    Raises:
-        DataError: two results answer for the same cell, or a file is of another kind.
-    """
-    index: dict[tuple[str, str, str], Result] = {}
-    for result, source in results:
-        if "metrics" not in result and "ms" not in result.get("speed", {}):
-            raise DataError.of(
-                source.path, expected="a result of nbavatar evaluate or speed", found="another JSON file"
-            )
-        protocol = result["protocol"]["name"] if "metrics" in result else ""
-        key = (str(result["subject"]), str(result["variant"]), protocol)
-        if key in index:
-            other = index[key][1].path
-            raise DataError.of(source.path, expected="one result a cell", found=f"the same cell in {other}")
-        index[key] = (result, source)
-    return index
+_TRIVIAL = ("psnr", "psnr_fg", "ssim")
 
 
 def build_table(
     name: str,
     layout: TableLayout,
-    printed: PrintedCells,
-    results: Mapping[tuple[str, str, str], Result],
+    printed: pd.DataFrame,
+    results: Sequence[Result],
     *,
     printed_source: Source,
     lpips_net: str = "vgg",
@@ -71,53 +50,45 @@ def build_table(
         name: its name.
         layout: rows, columns, panels.
         printed: result of ``read_printed``.
-        results: result of ``index_results``.
+        results: content and source of each evaluation and timing.
         printed_source: file and digest of the printed numbers.
         lpips_net: backbone shown in the LPIPS columns.
         size_label: if not empty, nothing reproduced is comparable with the paper, and this is the reason.
+
+    Raises:
+        DataError: two results answer for the same cell.
     """
-    layout = _with_subjects(layout, results)
-    panels = []
-    notes: list[str] = []
-    for panel in layout.panels:
-        groups = _groups(layout)
-        columns = [key for _, keys in groups for key in keys]
-        found = _ranked(_reproduced(layout, panel, columns, results, lpips_net), layout)
-        found += _single_subjects(layout, panel, results, lpips_net) if layout.kind == "mean" else []
+    numbers = tidy_results(results, images=False)
+    sources = {source.path: (source,) for _, source in results}
+    numbers = numbers.assign(sources=numbers["source"].map(sources), note="")
+    if layout.subjects == ["*"]:  # every subject that there is a result for
+        shown = numbers["variant"].isin(layout.variants) & numbers["protocol"].isin(layout.protocols)
+        layout = replace(layout, subjects=sorted(numbers["subject"][shown].unique()))
+    panels, blocks, notes = [], [], []
+    for i, panel in enumerate(layout.panels):
+        table = PanelTable(panel.title, _groups(layout))
+        grid = _grid(layout, panel, table.columns, numbers, lpips_net)
+        found = _reproduced(layout, grid, numbers, results)
         if panel.reported:
-            blocks = [_printed_block(layout, panel, columns, printed, printed_source)]
-            reasons = _reasons(layout, found, size_label)
+            own = [_printed(layout, panel, grid, printed, printed_source)]
+            reasons = size_label or _other_sizes(layout, found)
             if reasons:
-                remark = f"{'; '.join(reasons)}; not comparable with the paper"
-                blocks.append(Block("reproduced", f"Reproduced ({remark})", found, comparable=False))
+                remark = f"{reasons}; not comparable with the paper"
+                own.append(found.assign(heading=f"Reproduced ({remark})", comparable=False))
                 notes.append(f"Reproduced numbers: {remark}.")
             else:
-                blocks.append(Block("reproduced", "Reproduced", found))
-                difference = _difference_block(layout, *blocks)
-                if any(line.cells for line in difference.lines):
-                    blocks.append(difference)
+                own.append(found.assign(heading="Reproduced", comparable=True))
+                difference = _difference(layout, *own)
+                own += [difference] if any(difference["text"]) else []
         else:
-            blocks = [Block("reproduced", size_label or "Results", found, comparable=False)]
-        unseen = _unseen(layout, panel, results)
-        panels.append(PanelTable(panel.title, groups, blocks, unseen))
-        notes.extend(describe_deviations(layout, panel, printed))
-        used = [results[k] for k in results if k[2] == panel.protocol and k[1] in layout.variants]
-        if layout.kind == "speed" or layout.speeds:
-            notes.extend(describe_speeds(panel, [results[k] for k in results if k[2] == "" and k[1] in layout.speeds]))
-        if layout.kind in ("subjects", "mean", "subject"):
-            notes.extend(describe_protocol(panel, used, lpips_net))
-            notes.extend(describe_trainings(layout, used))
-    return Table(name, layout.title, layout.head, layout.label, _caption(layout), tuple(dict.fromkeys(notes)), panels)
-
-
-def _with_subjects(layout: TableLayout, results: Mapping[tuple[str, str, str], Result]) -> TableLayout:
-    """Resolves the subject ``*``: every subject that the table has a result for."""
-    if layout.subjects != ["*"]:
-        return layout
-    found = sorted(
-        {s for s, variant, protocol in results if variant in layout.variants and protocol in layout.protocols}
-    )
-    return replace(layout, subjects=found)
+            own = [found.assign(heading=size_label or "Results", comparable=False)]
+        own.append(_unseen(layout, panel, numbers).assign(comparable=all(block["comparable"].all() for block in own)))
+        panels.append(table)
+        blocks += [block.assign(panel=i) for block in own]
+        notes += _notes(layout, panel, printed, results, lpips_net)
+    cells = pd.concat(blocks, ignore_index=True)
+    notes = tuple(dict.fromkeys(notes))
+    return Table(name, layout.title, layout.head, layout.label, _caption(layout), notes, panels, cells)
 
 
 def _caption(layout: TableLayout) -> str:
@@ -127,6 +98,20 @@ def _caption(layout: TableLayout) -> str:
     elif layout.ranked:
         words.append("Best in bold, within each block.")
     return " ".join(words)
+
+
+def _notes(
+    layout: TableLayout, panel: Panel, printed: pd.DataFrame, results: Sequence[Result], lpips_net: str
+) -> list[str]:
+    notes = describe_deviations(layout, panel, printed)
+    if layout.speeds:
+        timed = [r for r in results if "metrics" not in r[0] and str(r[0]["variant"]) in layout.speeds]
+        notes += describe_speeds(panel, timed)
+    if layout.kind in ("subjects", "mean", "subject"):
+        judged = [r for r in results if "metrics" in r[0] and str(r[0]["variant"]) in layout.variants]
+        judged = [r for r in judged if r[0]["protocol"]["name"] == panel.protocol]
+        notes += [*describe_protocol(panel, judged, lpips_net), *describe_trainings(layout, judged)]
+    return notes
 
 
 def _groups(layout: TableLayout) -> list[tuple[str, list[str]]]:
@@ -139,239 +124,182 @@ def _groups(layout: TableLayout) -> list[tuple[str, list[str]]]:
     return [("", [f"{prefix}{metric}" for metric in layout.columns])]
 
 
-def _metric(column: str) -> str:
-    return column.rpartition(".")[2]
+def _grid(
+    layout: TableLayout, panel: Panel, columns: Sequence[str], numbers: pd.DataFrame, lpips_net: str
+) -> pd.DataFrame:
+    """All cells of a panel, with what tells the number of each; without text.
+
+    Where the table shows means only, rows of single subjects follow (``alone``): a mean is missing until all are there.
+    """
+    lines = [(row, "") for row in layout.rows]
+    if layout.kind == "mean":
+        known = set(zip(numbers["subject"], numbers["variant"], numbers["protocol"], strict=True))
+        lines += [(r, s) for r in layout.rows for s in layout.subjects if (s, r.variant, panel.protocol) in known]
+    cells = [
+        {
+            "line": line,
+            "label": f"{row.label}, {alone} alone" if alone else row.label,
+            "rule": row.rule and not alone,
+            "shaded": row.shaded and not alone,
+            "alone": alone,
+            "row": row.reported_id,
+            "column": column,
+            **dict(zip(_NUMBER, _number(layout, panel, row, column, alone, lpips_net), strict=True)),
+        }
+        for line, (row, alone) in enumerate(lines)
+        for column in columns
+    ]
+    return pd.DataFrame(cells).assign(shown=True, mark="")
 
 
-def _printed_block(
-    layout: TableLayout, panel: Panel, columns: Sequence[str], printed: PrintedCells, source: Source
-) -> Block:
-    lines = []
-    for row in layout.rows:
-        cells = {}
-        for column in columns:
-            cell = printed.get((panel.reported, row.reported_id, column)) if row.reported_id else None
-            if cell is not None:
-                value = _float(cell.text)
-                cells[column] = Cell(cell.text, value, sources=(source,), note=cell.note)
-        if cells or row.reported_id:
-            lines.append(TableLine(row.label, cells, row.rule, row.shaded))
-    return Block("printed", "Printed in the paper", _ranked(lines, layout))
+def _number(
+    layout: TableLayout, panel: Panel, row: TableRow, column: str, alone: str, lpips_net: str
+) -> tuple[str, str, str, str]:
+    """Subject, variant, protocol and metric of the number that a cell shows."""
+    subject, _, metric = column.rpartition(".")
+    if layout.kind == "cameras":
+        return row.stage, row.variant, panel.protocol, metric
+    if (layout.kind == "speed" or metric in TIMED) and not alone:
+        stage = "" if metric == "memory_mb" else f".{row.stage or 'total_fp32'}"
+        return "", row.variant, "", f"{metric}{stage}"
+    metric = f"lpips_{lpips_net}" if metric == "lpips" else metric
+    return alone or ("" if subject == "mean" else subject), row.variant, panel.protocol, metric
 
 
 def _reproduced(
-    layout: TableLayout,
-    panel: Panel,
-    columns: Sequence[str],
-    results: Mapping[tuple[str, str, str], Result],
-    lpips_net: str,
-) -> list[TableLine]:
-    lines = []
-    for row in layout.rows:
-        if not row.variant:
-            continue
-        cells = {}
-        for column in columns:
-            cell = _reproduced_cell(layout, panel, row, column, results, lpips_net)
-            if cell is not None:
-                cells[column] = cell
-        lines.append(TableLine(row.label, cells, row.rule, row.shaded))
-    return lines
-
-
-def _single_subjects(
-    layout: TableLayout, panel: Panel, results: Mapping[tuple[str, str, str], Result], lpips_net: str
-) -> list[TableLine]:
-    """Rows of single subjects below their mean, which is missing until all of them are there."""
-    lines = []
-    for row in layout.rows:
-        for subject in layout.subjects:
-            result = results.get((subject, row.variant, panel.protocol))
-            if result is None:
-                continue
-            cells = {}
-            for metric in layout.columns:
-                value = result[0]["metrics"].get(_key(metric, lpips_net))
-                if value is not None:
-                    cells[f"mean.{metric}"] = Cell(_text(metric, value), value, sources=(result[1],), note=subject)
-            lines.append(TableLine(f"{row.label}, {subject} alone", cells))
-    return lines
-
-
-def _reproduced_cell(
-    layout: TableLayout,
-    panel: Panel,
-    row: TableRow,
-    column: str,
-    results: Mapping[tuple[str, str, str], Result],
-    lpips_net: str,
-) -> Cell | None:
-    subject, _, metric = column.rpartition(".")
+    layout: TableLayout, grid: pd.DataFrame, numbers: pd.DataFrame, results: Sequence[Result]
+) -> pd.DataFrame:
     if layout.kind == "cameras":
-        return _camera_cell(results.get((row.stage, row.variant, panel.protocol)), metric)
-    if layout.kind == "speed" or metric in TIMED:
-        stage = row.stage or "total_fp32"
-        timings = [value for key, value in results.items() if key[1] == row.variant and key[2] == ""]
-        if layout.kind == "subject":
-            timings = [value for value in timings if value[0]["subject"] == layout.subjects[0]] or timings
-        return _speed_cell(timings[0], stage, metric) if timings else None
-    if metric in TRAINED:
-        return _trained_cell(results.get((subject, row.variant, panel.protocol)), metric)
-    if subject == "mean":
-        return _mean_cell(layout, panel, row, metric, results, lpips_net)
-    result = results.get((subject, row.variant, panel.protocol))
-    if result is None:
-        return None
-    value = result[0]["metrics"].get(_key(metric, lpips_net))
-    return None if value is None else Cell(_text(metric, value), value, sources=(result[1],))
+        known = _cameras(results)
+    else:
+        subject = layout.subjects[0] if layout.kind == "subject" else ""
+        known = pd.concat([numbers[numbers["protocol"] != ""], _means(numbers, layout.subjects)])
+        known = pd.concat([known, _timings(numbers, subject)])[[*_NUMBER, "value", "sources", "note"]]
+    cells = grid[grid["variant"] != ""].merge(known.drop_duplicates(_NUMBER), on=_NUMBER, how="left")
+    if layout.kind != "cameras":
+        cells["text"] = [
+            "" if math.isnan(v) else to_text(c, v) for c, v in zip(cells["column"], cells["value"], strict=True)
+        ]
+    single = cells["alone"] != ""
+    cells["note"] = cells["note"].where(~single, cells["alone"]).where(cells["text"] != "", "")
+    return _completed(_ranked(cells[~single], layout), cells[single]).assign(block="reproduced")
 
 
-def _mean_cell(
-    layout: TableLayout,
-    panel: Panel,
-    row: TableRow,
-    metric: str,
-    results: Mapping[tuple[str, str, str], Result],
-    lpips_net: str,
-) -> Cell | None:
-    found = [results.get((subject, row.variant, panel.protocol)) for subject in layout.subjects]
-    present = [result for result in found if result is not None]
-    values = [result[0]["metrics"].get(_key(metric, lpips_net)) for result in present]
-    numbers = [value for value in values if value is not None]
-    if not numbers or len(numbers) < len(layout.subjects):
-        return None
-    value = math.fsum(numbers) / len(numbers)
-    return Cell(_text(metric, value), value, sources=tuple(source for _, source in present))
+def _means(numbers: pd.DataFrame, subjects: Sequence[str]) -> pd.DataFrame:
+    """Means over all subjects, summed exactly, so that their order does not matter."""
+    kept = numbers[numbers["subject"].isin(list(subjects)) & (numbers["protocol"] != "")]
+    kept = kept[~kept["metric"].isin(TRAINED)]
+    kept = kept.sort_values("subject", key=lambda names: names.map(list(subjects).index), kind="stable")
+    means = kept.groupby(["variant", "protocol", "metric"], sort=False).agg(
+        value=("value", lambda values: math.fsum(values) / len(values)),
+        count=("value", "size"),
+        sources=("sources", lambda sources: sum(sources, ())),
+    )
+    return means[means["count"] == len(subjects)].reset_index().assign(subject="", note="")
 
 
-def _speed_cell(result: Result, stage: str, column: str) -> Cell | None:
-    """One timing; the stage ``renderer_half`` is fp16 where it was timed, else bf16."""
-    if column == "memory_mb":
-        memory = result[0]["speed"].get("peak_memory_mb")
-        return Cell(_text(column, float(memory)), float(memory), sources=(result[1],)) if memory else None
-    times = result[0]["speed"]["ms"]
-    names = [stage.replace("half", precision) for precision in ("fp16", "bf16")] if stage.endswith("half") else [stage]
-    name = next((name for name in names if times.get(name)), None)
-    if name is None:
-        return None
-    value = float(times[name]) if column == "ms" else 1000.0 / float(times[name])
-    return Cell(_text(column, value), value, sources=(result[1],), note=name)
+def _timings(numbers: pd.DataFrame, subject: str) -> pd.DataFrame:
+    """One timing a variant, of a subject if it has one, else of the first that has.
+
+    A stage that ends in ``half`` is fp16 where that was timed, else bf16. Frames per second are of the times.
+    """
+    timed = numbers[numbers["protocol"] == ""]
+    timed = timed.sort_values("subject", key=lambda names: names != subject, kind="stable")
+    timed = timed[timed["subject"] == timed.groupby("variant")["subject"].transform("first")]
+    stages = timed[timed["metric"].str.startswith("ms.")]
+    stages = stages.assign(note=stages["metric"].str.removeprefix("ms."))
+    halves = stages[stages["metric"].str.endswith(("_fp16", "_bf16"))]
+    halves = halves.sort_values("metric", key=lambda names: names.str[-4:], ascending=False, kind="stable")
+    stages = pd.concat([stages, halves.assign(metric=halves["metric"].str[:-4] + "half")])
+    rates = stages.assign(value=1000.0 / stages["value"], metric=stages["metric"].str.replace("ms.", "fps.", n=1))
+    return pd.concat([timed[timed["metric"] == "memory_mb"], stages, rates]).assign(subject="")
 
 
-def _trained_cell(result: Result | None, column: str) -> Cell | None:
-    """What a training cost, from the record that its renders carry."""
-    training = (result[0].get("training") or {}) if result is not None else {}
-    key, unit = {
-        "model_mb": ("model_bytes", 1e6),
-        "primitives": ("primitives", 1.0),
-        "train_minutes": ("train_seconds", 60.0),
-        "train_memory_mb": ("peak_memory_mb", 1.0),
-    }[column]
-    if result is None or training.get(key) is None:
-        return None
-    value = float(training[key]) / unit
-    return Cell(_text(column, value), value, sources=(result[1],))
+def _cameras(results: Sequence[Result]) -> pd.DataFrame:
+    rows = [
+        (content["subject"], content["variant"], content["protocol"]["name"], metric, ", ".join(content[key]), source)
+        for content, source in results
+        for metric, key in (("train_cameras", "train_cameras"), ("test_camera", "cameras"))
+        if "metrics" in content and content.get(key)
+    ]
+    cells = pd.DataFrame(rows, columns=[*_NUMBER, "text", "sources"], dtype=object)
+    return cells.assign(sources=[(replace(s, size=None),) for s in cells["sources"]], note="", value=math.nan)
 
 
-def _camera_cell(result: Result | None, column: str) -> Cell | None:
-    if result is None:
-        return None
-    cameras = result[0].get("train_cameras" if column == "train_cameras" else "cameras") or []
-    return Cell(", ".join(cameras), sources=(replace(result[1], size=None),)) if cameras else None
+def _printed(
+    layout: TableLayout, panel: Panel, grid: pd.DataFrame, printed: pd.DataFrame, source: Source
+) -> pd.DataFrame:
+    own = printed[printed["table"] == panel.reported][["row", "column", "value", "note"]]
+    cells = grid[(grid["row"] != "") & (grid["alone"] == "")].merge(own, on=["row", "column"], how="left")
+    cells = cells.rename(columns={"value": "text"}).fillna({"text": ""})
+    cells["value"] = pd.to_numeric(cells["text"], errors="coerce")
+    cells["sources"] = [(source,) if text else () for text in cells["text"]]
+    cells = _completed(_ranked(cells, layout))
+    return cells.assign(block="printed", heading="Printed in the paper", comparable=True)
 
 
-def _difference_block(layout: TableLayout, printed: Block, reproduced: Block) -> Block:
-    lines = []
-    by_label = {line.label: line for line in printed.lines}
-    for line in reproduced.lines:
-        other = by_label.get(line.label)
-        cells = {}
-        for column, cell in line.cells.items():
-            reference = other.cells.get(column) if other else None
-            if reference is None:
-                continue
-            cells[column] = _difference(_metric(column), cell, reference)
-        lines.append(TableLine(line.label, cells, line.rule, line.shaded))
+def _difference(layout: TableLayout, printed: pd.DataFrame, reproduced: pd.DataFrame) -> pd.DataFrame:
+    reference = printed.drop_duplicates(["label", "column"], keep="last")[["label", "column", "text", "sources"]]
+    cells = reproduced.merge(reference, on=["label", "column"], how="left", suffixes=("", "_printed"))
+    both = [bool(text) and bool(other) for text, other in zip(cells["text"], cells["text_printed"].fillna(""))]
+    texts = zip(cells["column"], cells["text"], cells["text_printed"], both, strict=True)
+    cells["text"] = [_subtracted(*three) if there else "" for *three, there in texts]
+    cells["value"] = pd.to_numeric(cells["text"], errors="coerce")
+    pairs = zip(cells["sources"], cells["sources_printed"], both, strict=True)
+    cells["sources"] = [(*own, *other) if there else () for own, other, there in pairs]
     word = "Comparison" if layout.kind == "cameras" else "Difference, reproduced - printed"
-    return Block("difference", word, lines)
+    return cells.assign(block="difference", heading=word, mark="", note="")
 
 
-def _difference(metric: str, cell: Cell, reference: Cell) -> Cell:
-    sources = (*cell.sources, *reference.sources)
-    if COLUMNS[metric].higher_is_better is None:
-        same = set(cell.text.split(", ")) == set(reference.text.split(", "))
-        return Cell("same" if same else "differs", sources=sources)
-    difference = Decimal(cell.text) - Decimal(reference.text)
-    digits = max(_decimals(cell.text), _decimals(reference.text))
-    text = f"{difference:+.{digits}f}" if difference else f"{abs(difference):.{digits}f}"
-    return Cell(text, float(difference), sources=sources)
+def _subtracted(column: str, text: str, printed: str) -> str:
+    """Reproduced - printed, of the digits shown; of cameras, whether they are the same."""
+    if style_of(column).higher_is_better is None:
+        return "same" if set(text.split(", ")) == set(printed.split(", ")) else "differs"
+    difference = Decimal(text) - Decimal(printed)
+    digits = max(len(number.partition(".")[2]) for number in (text, printed))
+    return f"{difference:+.{digits}f}" if difference else f"{abs(difference):.{digits}f}"
 
 
-def _decimals(text: str) -> int:
-    return len(text.partition(".")[2])
+def _other_sizes(layout: TableLayout, cells: pd.DataFrame) -> str:
+    """Sizes of the reproduced images that are not the paper's, in words; empty if there is none."""
+    sizes = {source.size for sources in cells["sources"] for source in sources}
+    other = sorted(size for size in sizes - {(layout.size, layout.size)} if size is not None)
+    return "size " + ", ".join(f"{w} x {h} px" for w, h in other) if other else ""
 
 
-def _reasons(layout: TableLayout, lines: Sequence[TableLine], size_label: str) -> list[str]:
-    """Why reproduced numbers are not comparable with the paper's; empty if they are."""
-    if size_label:
-        return [size_label]
-    paper = (layout.size, layout.size)
-    sizes = {source.size for line in lines for cell in line.cells.values() for source in cell.sources}
-    other = sorted(size for size in sizes if size is not None and size != paper)
-    return ["size " + ", ".join(f"{w} x {h} px" for w, h in other)] if other else []
-
-
-def _ranked(lines: Sequence[TableLine], layout: TableLayout) -> list[TableLine]:
+def _ranked(cells: pd.DataFrame, layout: TableLayout) -> pd.DataFrame:
     if not layout.ranked:
-        return list(lines)
-    columns = list(dict.fromkeys(column for line in lines for column in line.cells))
-    result = [dict(line.cells) for line in lines]
-    for column in columns:
-        higher = COLUMNS[_metric(column)].higher_is_better
-        if higher is None:
-            continue
-        texts = [line.cells[column].text if column in line.cells else MISSING for line in lines]
-        marks = rank_marks(texts, higher_is_better=higher, second=layout.second)
-        for cells, mark in zip(result, marks, strict=True):
-            if column in cells:
-                cells[column] = replace(cells[column], mark=mark)
-    return [replace(line, cells=cells) for line, cells in zip(lines, result, strict=True)]
+        return cells
+    cells = cells.copy()
+    for column, texts in cells.groupby("column")["text"]:
+        higher = style_of(column).higher_is_better
+        if higher is not None:
+            cells.loc[texts.index, "mark"] = rank_marks(texts, higher_is_better=higher, second=layout.second)
+    return cells
 
 
-def _unseen(
-    layout: TableLayout, panel: Panel, results: Mapping[tuple[str, str, str], Result]
-) -> list[tuple[str, str, str, Cell]]:
-    """What the csv carries beyond the table: foreground metrics, every LPIPS net, the trivial answers."""
-    found = []
-    for row in layout.rows:
-        for subject in layout.subjects:
-            result = results.get((subject, row.variant, panel.protocol))
-            if result is None or not panel.protocol:
-                continue
-            values = {key: result[0]["metrics"].get(key) for key in _EXTRA}
-            for answer, metrics in (result[0].get("trivial") or {}).items():
-                values |= {f"{answer}.{metric}": metrics.get(metric) for metric in ("psnr", "psnr_fg", "ssim")}
-            for key, value in values.items():
-                if value is not None:
-                    cell = Cell(_text(key.rpartition(".")[2], value), value, sources=(result[1],))
-                    found.append(("reproduced", row.label, f"{subject}.{key}", cell))
-    return found
+def _completed(*parts: pd.DataFrame) -> pd.DataFrame:
+    """Parts as one, with no source and no remark where there is no number."""
+    cells = pd.concat(parts, ignore_index=True)
+    sources = [sources if isinstance(sources, tuple) else () for sources in cells["sources"]]
+    return cells.assign(sources=sources, note=cells["note"].fillna(""), text=cells["text"].fillna(""))
 
 
-def _key(metric: str, lpips_net: str) -> str:
-    return f"lpips_{lpips_net}" if metric == "lpips" else metric
-
-
-def _text(metric: str, value: float) -> str:
-    style = COLUMNS["lpips" if metric.startswith("lpips") else metric]
-    digits = style.digits
-    if metric == "fps" and value < 10:
-        digits = 2 if value < 1 else 1
-    return f"{value:.{digits}f}"
-
-
-def _float(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
+def _unseen(layout: TableLayout, panel: Panel, numbers: pd.DataFrame) -> pd.DataFrame:
+    """What the csv has beyond the table: foreground metrics, every LPIPS net, the trivial answers."""
+    own = numbers[numbers["protocol"] == panel.protocol] if panel.protocol else numbers[:0]
+    trivial = [m for m in own["metric"].unique() if "." in m and m.rpartition(".")[2] in _TRIVIAL]
+    grid = pd.DataFrame(
+        [
+            (i, row.label, row.variant, subject, metric)
+            for i, row in enumerate(layout.rows)
+            for subject in layout.subjects
+            for metric in (*_EXTRA, *trivial)
+        ],
+        columns=["line", "label", "variant", "subject", "metric"],
+        dtype=object,
+    )
+    cells = grid.merge(own, on=["variant", "subject", "metric"])
+    cells = cells.assign(column=[f"{s}.{m}" for s, m in zip(cells["subject"], cells["metric"], strict=True)])
+    cells["text"] = [to_text(metric, value) for metric, value in zip(cells["metric"], cells["value"], strict=True)]
+    return cells.assign(block="reproduced", mark="", heading="", rule=False, shaded=False, shown=False)

@@ -27,7 +27,6 @@ PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 
 # Declared, and imported nowhere: who uses it instead.
 UNIMPORTED = {
-    "pandas": "opens the result tables in notebooks; Snakemake's own helpers ask for it",
     "pygments": "snakemake --report",
     "snakemake": "run as a command",
     "snakemake-executor-plugin-slurm": "loaded by snakemake",

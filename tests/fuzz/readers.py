@@ -236,20 +236,24 @@ def _printed(path: Path) -> None:
     from nbavatar.reporting.printed import deviating_marks, deviating_means
 
     cells = _read_printed(str(path))
-    for table in {name for name, _, _ in cells}:
+    for table in cells["table"].unique():
         deviating_means(cells, table, ["S1", "S2"]), deviating_marks(cells, table, second=True)
 
 
 def _table(path: Path) -> None:
-    from nbavatar.cli.table import read_results
+    from nbavatar.cli.results import read_results
     from nbavatar.config.tables import read_tables
     from nbavatar.reporting.cells import Source
     from nbavatar.reporting.formats import to_csv, to_latex, to_markdown
-    from nbavatar.reporting.tables import build_table, index_results
+    from nbavatar.reporting.printed import read_printed
+    from nbavatar.reporting.results import tidy_results
+    from nbavatar.reporting.tables import build_table
 
-    results = index_results(read_results([str(path)]))
+    results = read_results([str(path)])
+    tidy_results(results)
+    printed = read_printed(["table,row,column,value,mark,note"], "printed")
     for name, layout in read_tables(path.with_name("tables.yaml")).items():
-        table = build_table(name, layout, {}, results, printed_source=Source("printed", "0"))
+        table = build_table(name, layout, printed, results, printed_source=Source("printed", "0"))
         to_csv(table), to_markdown(table), to_latex(table)
 
 

@@ -78,7 +78,7 @@ def _config(**changes):
 
 # `reenact` and `extremes` need no avatar.
 AFTER_TRAINING = {
-    "train": 13, "render": 18, "evaluate": 18, "speed": 7, "table": 8, "report": 1,
+    "train": 13, "render": 18, "evaluate": 18, "speed": 7, "table": 8, "report": 1, "collect": 1,
     "figure": 4, "video": 2, "tradeoff": 1,
 }  # fmt: skip
 
@@ -89,13 +89,15 @@ def test_nothing_is_done_twice(finished):
 
 def test_an_option_of_evaluation_runs_evaluation_only(edit):
     plan = edit("config/smoke.yaml", _config(stages__evaluate={"foreground_threshold": 0.9}))
-    assert plan == {"evaluate": 18, "table": 7, "figure": 2, "report": 1}  # ablation and pareto show results
+    # Of the figures, ablation and pareto show results.
+    assert plan == {"evaluate": 18, "table": 7, "figure": 2, "report": 1, "collect": 1}
 
 
 def test_an_option_of_one_variant_runs_that_variant_only(edit):
     text = {"stages": {"train": {"billboards": {"channels": 4}}}}
     plan = edit("config/smoke.yaml", _config(variants__ch03=text))
-    assert plan == {"train": 1, "render": 1, "evaluate": 1, "speed": 1, "table": 1, "figure": 1, "report": 1}
+    shown = {"table": 1, "figure": 1, "report": 1, "collect": 1}
+    assert plan == {"train": 1, "render": 1, "evaluate": 1, "speed": 1} | shown
 
 
 def test_an_option_of_training_retrains_everything_and_rebuilds_no_image(edit):
@@ -135,7 +137,7 @@ def test_an_edit_of_the_metrics_does_not_retrain(edit):
 def test_a_new_row_of_the_sheet_runs_that_row_only(edit):
     plan = edit("config/smoke/runs.tsv", lambda text: text + "S2\tno_nb\tsr1024\n")
     # It is made although no table shows it: a row that nobody asks for would be a silent omission.
-    assert plan == {"render": 1, "evaluate": 1, "report": 1} | ({"table": 1} if "table" in plan else {})
+    assert plan == {"render": 1, "evaluate": 1, "report": 1, "collect": 1} | ({"table": 1} if "table" in plan else {})
 
 
 def test_an_edit_of_printed_numbers_rebuilds_tables_only(edit):
@@ -178,9 +180,9 @@ def test_a_lost_result_is_made_again_with_what_follows(finished):
 
 # A capture: 3 cameras, of which c1 is held out.
 CHECKED = {"check": 1, "check_sheet": 1}
-JUDGED = {"render": 2, "evaluate": 2, "speed": 1, "table": 3, "report": 1, "figure": 4, "video": 2}
+JUDGED = {"render": 2, "evaluate": 2, "speed": 1, "table": 3, "report": 1, "collect": 1, "figure": 4, "video": 2}
 TRAINED = {"train": 1, **JUDGED}
-HELD_OUT = {"render": 1, "evaluate": 1, "table": 1, "figure": 2, "report": 1}
+HELD_OUT = {"render": 1, "evaluate": 1, "table": 1, "figure": 2, "report": 1, "collect": 1}
 
 
 class Capture:

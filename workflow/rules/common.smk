@@ -528,6 +528,7 @@ EVERYTHING = [
     *([f"{R}/extremes/table.md"] if RUN.extremes else []),
     *(f"{R}/figures/{figure}.png" for figure in FIGURES),
     *evals_of(ROWS),
+    f"{R}/results.csv",
     *(
         f"{R}/tables/{table}.{suffix}"
         for table in TABLES

@@ -1,8 +1,27 @@
 """Tables and the report.
 
 REQUIRED INPUTS: results/{run}/eval/**, results/{run}/speed/**, config/tables.yaml, config/reported.csv
-OUTPUTS: results/{run}/tables/{table}.{csv,md,tex,html}, results/{run}/report/index.html
+OUTPUTS: results/{run}/results.csv, results/{run}/tables/{table}.{csv,md,tex,html}, results/{run}/report/index.html
 """
+
+
+# Every number of the run, image by image; nbavatar/reporting/results.py tells its columns and how a notebook opens it.
+rule collect:
+    input:
+        evals=evals_of(ROWS),
+        speeds=sorted({path for table in TABLES for path in speeds_of(table)}),
+    output:
+        "results/{run}/results.csv",
+    log:
+        "logs/{run}/collect.log",
+    resources:
+        mem="4GB",
+        runtime="10m",
+    params:
+        code=code_digest("collect"),
+    shell:
+        "nbavatar collect --run {wildcards.run:q} --evals {input.evals:q} --speeds {input.speeds:q} --out {output:q}"
+        " > {log:q} 2>&1"
 
 
 # A table asks for the results of its own rows only: an edit of one variant rebuilds the tables that show it.

@@ -3,6 +3,7 @@
 from decimal import Decimal
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from nbavatar.config.tables import read_tables
@@ -22,10 +23,7 @@ def cells():
 
 
 def test_every_printed_number_is_there(cells):
-    counts = {}
-    for table, _, _ in cells:
-        counts[table] = counts.get(table, 0) + 1
-    assert counts == {
+    assert cells["table"].value_counts().to_dict() == {
         "novel_view_1024": 3 * 5 * 3,
         "self_reenactment_1024": 3 * 5 * 3,
         "interactavatar_512_novel_view": 6,
@@ -40,7 +38,7 @@ def test_every_printed_number_is_there(cells):
 def test_checksums_of_the_printed_tables(cells):
     # Sums of all PSNR, SSIM and LPIPS cells, added up by hand from the paper's LaTeX source.
     def total(table, metric):
-        return sum(Decimal(c.text) for (t, _, col), c in cells.items() if t == table and col.endswith(metric))
+        return sum(map(Decimal, cells["value"][(cells["table"] == table) & cells["column"].str.endswith(metric)]))
 
     assert total("novel_view_1024", "psnr") == Decimal("380.63")
     assert total("self_reenactment_1024", "psnr") == Decimal("381.72")
@@ -52,8 +50,9 @@ def test_checksums_of_the_printed_tables(cells):
 @pytest.mark.parametrize("table", GRIDS)
 def test_recomputed_means_reproduce_the_printed_ones(cells, table):
     assert deviating_means(cells, table, SUBJECTS) == []
-    mean = recomputed_mean([cells["novel_view_1024", "SA", f"{s}.psnr"].text for s in SUBJECTS])
-    assert mean == Decimal("25.1675") and cells["novel_view_1024", "SA", "mean.psnr"].text == "25.17"
+    texts = cells.set_index(["table", "row", "column"])["value"]
+    mean = recomputed_mean([texts["novel_view_1024", "SA", f"{s}.psnr"] for s in SUBJECTS])
+    assert mean == Decimal("25.1675") and texts["novel_view_1024", "SA", "mean.psnr"] == "25.17"
 
 
 def test_recomputed_marks_reproduce_the_printed_ones_but_for_ties(cells):
@@ -68,9 +67,9 @@ def test_recomputed_marks_reproduce_the_printed_ones_but_for_ties(cells):
 
 
 def test_a_wrong_mean_and_a_wrong_mark_are_found(cells):
-    changed = dict(cells)
-    key = ("novel_view_1024", "GA", "mean.psnr")
-    changed[key] = type(cells[key])("25.32", "best")
+    changed = cells.set_index(["table", "row", "column"])
+    changed.loc[("novel_view_1024", "GA", "mean.psnr"), ["value", "mark"]] = "25.32", "best"
+    changed = changed.reset_index()
     assert deviating_means(changed, "novel_view_1024", SUBJECTS) == [("GA", "psnr", "25.32", Decimal("25.3075"))]
     assert deviating_marks(changed, "novel_view_1024", second=True) == [("GA", "mean.psnr", "best", "second")]
 
@@ -78,10 +77,10 @@ def test_a_wrong_mean_and_a_wrong_mark_are_found(cells):
 def test_cells_that_the_layout_asks_for_exist(cells):
     for name, table in read_tables(ROOT / "config/tables.yaml").items():
         for panel in table.panels:
-            rows = {row for t, row, _ in cells if t == panel.reported}
+            own = cells[cells["table"] == panel.reported]
             wanted = {row.reported_id for row in table.rows if row.reported_id and panel.reported}
-            assert rows == wanted, name
-            columns = {col.rpartition(".")[2] for t, _, col in cells if t == panel.reported}
+            assert set(own["row"]) == wanted, name
+            columns = {column.rpartition(".")[2] for column in own["column"]}
             assert columns == set(table.columns) or not panel.reported, name
 
 
@@ -99,7 +98,7 @@ def test_cells_that_the_layout_asks_for_exist(cells):
     ],
 )
 def test_rank_marks(texts, higher, second, marks):
-    assert rank_marks(texts, higher_is_better=higher, second=second) == marks
+    assert list(rank_marks(pd.Series(texts), higher_is_better=higher, second=second)) == marks
 
 
 @pytest.mark.parametrize(
