@@ -6,10 +6,11 @@ so it names no folder above and no hidden file, is no option of a command, and m
 
 import re
 import unicodedata
+from collections.abc import Iterable
 
 from nbavatar.errors import NBAvatarError, describe
 
-__all__ = ["LONGEST", "check_name", "check_place", "is_name", "name_like"]
+__all__ = ["LONGEST", "check_apart", "check_name", "check_place", "is_name", "name_like"]
 
 LONGEST = 120
 """Bytes of a name in UTF-8. File systems take 255, and stages add suffixes and temporary endings."""
@@ -41,6 +42,21 @@ def check_name(text: str, where: object, field: str = "", *, error: type[NBAvata
         rule = f"a name of letters, digits, '.', '_' and '-' that begins with a letter or digit, up to {LONGEST} bytes"
         raise error.of(where, field, expected=rule, found=describe(text), fix="rename it")
     return text
+
+
+def check_apart(names: Iterable[str], where: object, field: str = "", *, error: type[NBAvatarError]) -> None:
+    """Refuses two names that are written with other characters and read the same: composed letters and their parts.
+
+    Some file systems keep only one of them, and a person cannot tell them apart.
+
+    Raises:
+        NBAvatarError: of class `error`, one line.
+    """
+    known: dict[str, str] = {}
+    for name in names:
+        if not name.isascii() and (other := known.setdefault(unicodedata.normalize("NFC", name), name)) != name:
+            found = f"{other!a} and {name!a}"
+            raise error.of(where, field, expected="names that look different", found=found, fix="rename one of them")
 
 
 def check_place(path: str, where: object, field: str = "", *, error: type[NBAvatarError]) -> str:

@@ -1,6 +1,7 @@
 """Everything that can be wrong with a capture, found in one go and said in one line each."""
 
 import dataclasses
+import hashlib
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -31,6 +32,7 @@ from nbavatar.preprocess.supplied_masks import supplied_masks
 __all__ = ["CaptureReport", "Supplied", "check_capture"]
 
 _SIZES = {"head": (0.1, 0.8), "right_hand": (0.05, 0.7), "left_hand": (0.05, 0.7)}  # plausible diagonals [m]
+_UNITS = {"millimetres": 1000.0, "centimetres": 100.0}
 _MUCH_ASTRAY = 0.15  # share of a mesh's pixels off its part, of which a note is made
 
 
@@ -86,8 +88,15 @@ class _Collector:
         self._groups.setdefault(group, []).append(line)
 
     def close(self) -> None:
-        for lines in self._groups.values():
-            more = f" (and {len(lines) - 1} more like it)" if len(lines) > 1 else ""
+        alike: dict[str, dict[str, list[str]]] = {}
+        for group, lines in self._groups.items():
+            # One cause is often found in every camera: what expects the same is told once.
+            same = re.search(r"(?:(?<=: )\w+: )?(?:expected|unknown key) .*?(?=, found |; |$)", lines[0])
+            alike.setdefault(same[0] if same else group, {})[group] = lines
+        for groups in alike.values():
+            lines = [line for lines in groups.values() for line in lines]
+            where = f", in {', '.join(group.split()[-1] for group in groups)}" if len(groups) > 1 else ""
+            more = f" (and {len(lines) - 1} more like it{where})" if len(lines) > 1 else ""
             self._lines.append(lines[0] + more)
 
 
@@ -151,6 +160,14 @@ def _cameras(root: Path, found: _Collector, pixel_center: float) -> dict[str, Ca
     for name, entry in read_rig(path).items():
         camera = found.attempt(f"camera {name}", lambda: camera_of(name, entry, path, pixel_center))  # noqa: B023
         if camera is not None:
+            twin = next(
+                (n for n, c in cameras.items() if np.array_equal(c.cam_from_world, camera.cam_from_world)), None
+            )
+            if twin is not None:
+                line = DataError.of(
+                    f"{path}: camera {name}", "R, t", expected="a pose of its own", found=f"that of {twin}"
+                )
+                found.note("twins", str(line))
             cameras[name] = camera
     return cameras
 
@@ -169,18 +186,11 @@ def _check_meshes(capture: Capture, report: CaptureReport, found: _Collector) ->
             continue
         if "head" in mesh and "head" in first and ("head_rigid" in mesh) != ("head_rigid" in first):
             found.note("rigid", f"{path}: head_rigid: expected it in all frames or in none, found it only in some")
-        for part, (low, high) in _SIZES.items():
-            if part in mesh:
-                size = float(np.linalg.norm(np.ptp(mesh[part], axis=0)))
-                if not low <= size <= high:
-                    expected = f"a size of {low} to {high} m"
-                    error = DataError.of(
-                        path, part, expected=expected, found=f"{size:.3g}", fix="lengths must be metres"
-                    )
-                    found.note(f"size {part}", str(error))
         meshes[frame] = mesh
         first = mesh | first
     if meshes:
+        if _check_sizes(root, meshes, found):
+            return {}
         for part, (faces, rest) in report.topology.items():
             mesh = next((mesh for mesh in meshes.values() if part in mesh), None)
             if mesh is None:
@@ -192,6 +202,35 @@ def _check_meshes(capture: Capture, report: CaptureReport, found: _Collector) ->
                 for line in mesh_faults(root / "meshes", state, faces, rest, of_part) if of_part else ():
                     found.note(f"surface {part}", line)
     return meshes
+
+
+def _check_sizes(root: Path, meshes: dict[str, dict[str, np.ndarray]], found: _Collector) -> bool:
+    """Notes parts that are no people's; whether all lengths are in another unit, which explains what else is wrong."""
+    sizes = {
+        (frame, part): float(np.linalg.norm(np.ptp(mesh[part], axis=0)))
+        for frame, mesh in meshes.items()
+        for part in _SIZES
+        if part in mesh
+    }
+
+    def fits(part: str, size: float) -> bool:
+        return _SIZES[part][0] <= size <= _SIZES[part][1]
+
+    wrong = {key: size for key, size in sizes.items() if not fits(key[1], size)}
+    units = {
+        unit: times
+        for unit, times in _UNITS.items()
+        if len(wrong) == len(sizes) and all(fits(part, size / times) for (_, part), size in sizes.items())
+    }
+    for (frame, part), size in wrong.items():
+        low, high = _SIZES[part]
+        fix = "lengths must be metres"
+        for unit, times in list(units.items())[:1]:
+            fix = f"lengths look like {unit}: divide vertices by {times:g}, and each t that is in {unit} too"
+        where, expected = root / "meshes" / f"{frame}.npz", f"a size of {low} to {high} m"
+        error = DataError.of(where, part, expected=expected, found=f"{size:.3g}", fix=fix)
+        found.note("sizes", str(error))
+    return bool(units)
 
 
 def _check_camera(
@@ -210,8 +249,7 @@ def _check_camera(
             if meaning is not None and meaning.white not in (0, 255, 65535):
                 where = capture.root / kind / name
                 report.notes.append(f"{where}: a matte in which {meaning.white} is full coverage")
-    for frame in progress(report.frames, f"check {name}"):
-        found.attempt(f"images {name}", lambda: read_rgb(capture, camera, frame))  # noqa: B023
+    _check_images(capture, camera, report.frames, found, judge.moving, progress)
     if report.supplied.folder:
         folder, parts = Path(report.supplied.folder), tuple(report.topology)
         own = found.attempt(
@@ -221,6 +259,10 @@ def _check_camera(
             shown = zip(report.frames, own[0])
             _check_masks(folder / name, camera, shown, own[1].kind == "label", report, found, judge)
     elif masks is not None and (masks.mask is not None or masks.coverage is not None):
+        others = [other for other in capture.cameras if any((capture.root / "masks" / other).glob("*"))]
+        if masks.mask is None and others:
+            where, expected = capture.root / "masks" / name, f"masks as of camera {others[0]}"
+            found.note(f"no mask {name}", str(DataError.of(where, expected=expected, found="none")))
         labelled, there = masks.mask is not None and masks.mask.kind == "label", masks.mask is not None
         shown = ((frame, masks.read_mask(frame) if there else masks.read_coverage(frame)) for frame in report.frames)
         _check_masks(capture.root / "masks" / name, camera, shown, labelled, report, found, judge)
@@ -228,6 +270,31 @@ def _check_camera(
         where = capture.root / "masks" / name
         line = DataError.of(where, expected="a mask (or an alpha image) for each frame", found="none")
         found.note(f"no mask {name}", str(line))
+
+
+def _check_images(
+    capture: Capture,
+    camera: Camera,
+    frames: list[str],
+    found: _Collector,
+    moving: bool,
+    progress: Callable[[Iterable[str], str], Iterable[str]],
+) -> None:
+    """Reads all images of a camera, and compares them with each other."""
+    where, blank, digests = capture.root / "images" / camera.name, 0, set()
+    for frame in progress(frames, f"check {camera.name}"):
+        image = found.attempt(f"images {camera.name}", lambda: read_rgb(capture, camera, frame))  # noqa: B023
+        if image is not None:
+            blank += int(image.min() == image.max())
+            digests.add(hashlib.sha256(image.tobytes()).digest())
+    if frames and blank == len(frames):
+        found.note(
+            f"blank {camera.name}",
+            str(DataError.of(where, expected="pictures of someone", found="one colour in all of them")),
+        )
+    elif len(frames) > 2 and len(digests) == 1 and moving:
+        line = DataError.of(where, expected="a film, as the meshes move", found=f"{len(frames)} times the same picture")
+        found.note(f"still {camera.name}", str(line))
 
 
 def _check_masks(

@@ -2,11 +2,13 @@
 
 The misfit of a camera is judged pixel by pixel, over a few frames: the share of the meshes' pixels that do not lie on
 their own part of the mask. What users' cameras go wrong by is then tried out (camera to world, other axes, units, a
-position in place of t, calibrations of two cameras exchanged), and said if it explains the misfit.
+position in place of t, calibrations of two cameras exchanged, mirrored or turned pictures, frames counted from
+another one), and said if it explains the misfit.
 """
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -28,6 +30,14 @@ _LEAST_KEPT = 0.9  # of what the meshes cover
 _TRIED = 6  # cameras, the worst: a reading is true of all
 _LEAST_GAIN = 0.03
 _GOOD = 0.15  # misfit that an explanation leaves at most
+_OUT_OF_STEP = 0.015  # what another frame's mesh gains at least, where it is the right one
+_ELSEWHERE = 0.8  # misfit of one part in all cameras, when its mesh is somewhere else
+_LEAST_SEEN = 50  # pixels by which a part is judged on its own
+_FLIPS = {
+    "are mirrored: flip them left to right": (slice(None), slice(None, None, -1)),
+    "are mirrored: flip them upside down": (slice(None, None, -1), slice(None)),
+    "are turned by 180 degrees: turn them": (slice(None, None, -1), slice(None, None, -1)),
+}
 _LEAST_COVERED = 0.1  # share of a mask that meshes cover at least; a person's body has no mesh, so it can be little
 
 
@@ -133,6 +143,18 @@ class PoseJudge:
     ) -> None:
         self._cameras, self._topology, self._meshes = cameras, topology, meshes
         self._views: dict[str, list[_View]] = {}
+        self._known: dict[str, _Fit] = {}
+        self._parts: dict[str, list[tuple[float, float]]] = {}
+
+    @property
+    def moving(self) -> bool:
+        """Whether the meshes are not the same in all frames."""
+        first = next(iter(self._meshes.values()), {})
+        return any(
+            part in first and not np.array_equal(verts, first[part])
+            for mesh in self._meshes.values()
+            for part, verts in mesh.items()
+        )
 
     def add(self, camera: str, frame: str, mask: np.ndarray, *, labelled: bool) -> None:
         """Takes one mask, `[H, W]` of the camera's size: labels 0..3, or above 0 wherever the person is."""
@@ -140,6 +162,7 @@ class PoseJudge:
         small = np.ascontiguousarray(mask[step // 2 :: step, step // 2 :: step])
         if frame in self._meshes and small.any():
             self._views.setdefault(camera, []).append(_View(frame, small, labelled))
+            self._known.clear()
 
     def misfits(self) -> dict[str, float]:
         """Camera -> misfit from 0 to 1, mean over its frames; cameras without a mask are left out."""
@@ -156,8 +179,10 @@ class PoseJudge:
             path: `cameras.json`, for the lines.
         """
         now = self._fits()
-        if not now or max(fit.misfit for fit in now.values()) < _SUSPICIOUS:
-            return []
+        root = Path(str(path)).parent
+        if max((fit.misfit for fit in now.values()), default=0.0) < _SUSPICIOUS:  # no camera is wrong, frames may be
+            other = self._out_of_step(now, root)
+            return [] if other is None else [str(other)]
         expected = "meshes that project onto the masks"
         exchanged, before, after = self._exchange(now)
         strange = {name: fit for name, fit in now.items() if fit.misfit >= _STRANGE}
@@ -170,6 +195,9 @@ class PoseJudge:
             found = f"{1 - _mean(strange.values()).misfit:.0%} of their pixels there in {', '.join(strange)}"
             fix = f"{1 - meant:.0%} would lie there if {reading.text}"
             return [str(DataError.of(path, "R, t", expected=expected, found=found, fix=fix))]
+        other = self._other_pictures(strange, root) or self._out_of_step(now, root)
+        if other is not None:
+            return [str(other)]
         fix = "R, t must map world to camera (OpenCV axes), lengths be metres, names of frames belong together"
         return [
             str(
@@ -182,10 +210,80 @@ class PoseJudge:
             )
             for name, fit in now.items()
             if fit.misfit > _WORST
-        ]
+        ] or self._lost_parts(root)
+
+    def _other_pictures(self, strange: Iterable[str], root: Path) -> DataError | None:
+        """Cameras whose pictures are mirrored or turned, if that is what is wrong with them."""
+        for text, flip in _FLIPS.items():
+            found, fits = [], []
+            for name in strange:
+                views = [dataclasses.replace(view, mask=view.mask[flip]) for view in self._views[name]]
+                after = _mean(self._compare(view, self._cameras[name]) for view in views)
+                if _explains(self._fits()[name], after):
+                    found.append(name)
+                    fits.append(after)
+            if found:
+                share = 1 - _mean(self._fits()[name] for name in found).misfit
+                return DataError.of(
+                    root / "masks" / found[0], expected="masks on which the meshes project",
+                    found=f"{share:.0%} of their pixels there in {', '.join(found)}",
+                    fix=f"{1 - _mean(fits).misfit:.0%} would lie there if images and masks {text}",
+                )  # fmt: skip
+        return None
+
+    def _out_of_step(self, now: Mapping[str, _Fit], root: Path) -> DataError | None:
+        """Cameras whose masks have the meshes of other frames, counted in another way, if any."""
+        order = list(self._meshes)
+        place, last = {frame: i for i, frame in enumerate(order)}, len(order) - 1
+        for words, turn, step in (
+            ("next frame", 1, 1),
+            ("frame before", 1, -1),
+            ("frame as far from the end", -1, last),
+        ):
+            meant = {frame: order[turn * i + step] for frame, i in place.items() if 0 <= turn * i + step <= last}
+            found, pairs = [], []
+            for name in now:
+                views = [view for view in self._views[name] if meant.get(view.frame, view.frame) != view.frame]
+                if len(views) < 2:
+                    continue
+                others = [dataclasses.replace(view, frame=meant[view.frame]) for view in views]
+                before, after = (_mean(self._compare(v, self._cameras[name]) for v in some) for some in (views, others))
+                if after.misfit <= 0.5 * before.misfit and before.misfit - after.misfit >= _OUT_OF_STEP:
+                    found.append(name)
+                    pairs.append((before, after))
+            if found:
+                before, after = (_mean(fits) for fits in zip(*pairs))
+                return DataError.of(
+                    root / "masks" / found[0], expected="masks and meshes of the same moment",
+                    found=f"{1 - before.misfit:.0%} of the meshes' pixels on the masks of {', '.join(found)}",
+                    fix=f"{1 - after.misfit:.0%} would lie there with meshes of the {words}; number both alike",
+                )  # fmt: skip
+        return None
+
+    def _lost_parts(self, root: Path) -> list[str]:
+        """One line for each part that lies elsewhere than its label in all cameras, though the others do not."""
+        lines = []
+        for part, pairs in self._parts.items():
+            met, weight = np.sum(pairs, axis=0)
+            if weight >= _LEAST_SEEN and met < (1 - _ELSEWHERE) * weight:
+                label, share = PARTS.index(part) + 1, met / weight
+                error = DataError.of(
+                    root / "meshes", part, expected=f"vertices that project onto label {label} of the masks",
+                    found=f"{share:.0%} of their pixels there",
+                    fix="are they in the world of the cameras, and of the frame that the file is named after?",
+                )  # fmt: skip
+                lines.append(str(error))
+        return lines
 
     def _fits(self) -> dict[str, _Fit]:
-        return {name: self._fit(name, self._cameras[name]) for name in self._views}
+        if not self._known:
+            self._parts.clear()
+            for name, views in self._views.items():
+                found = [self._measure(view, self._cameras[name]) for view in views]
+                self._known[name] = _mean(fit for fit, _ in found)
+                for part, pair in (item for _, parts in found for item in parts.items()):
+                    self._parts.setdefault(part, []).append(pair)
+        return self._known
 
     def _exchange(self, now: Mapping[str, _Fit]) -> tuple[dict[str, str], float, float]:
         """Camera -> camera whose calibration fits its masks, where that is another; their misfits now and then."""
@@ -232,6 +330,10 @@ class PoseJudge:
         return _mean(self._compare(view, camera) for view in self._views[name])
 
     def _compare(self, view: _View, camera: Camera) -> _Fit:
+        return self._measure(view, camera)[0]
+
+    def _measure(self, view: _View, camera: Camera) -> tuple[_Fit, dict[str, tuple[float, float]]]:
+        """The fit of a view; and, where masks are labels, part -> pixels that are met, and pixels."""
         mesh, (height, width) = self._meshes[view.frame], view.mask.shape
         names = [part for part in PARTS if part in mesh and part in self._topology]
         offsets = np.cumsum([0] + [len(mesh[part]) for part in names])
@@ -252,16 +354,17 @@ class PoseJudge:
         if view.labelled:
             # A part that is in the mask has to be drawn as well: it may lie outside the image.
             shown = np.where(drawn, part[face], 0)
-            pairs = [(shown == PARTS.index(name) + 1, view.mask == PARTS.index(name) + 1) for name in names]
+            pairs = {name: (shown == PARTS.index(name) + 1, view.mask == PARTS.index(name) + 1) for name in names}
         else:
-            pairs = [(drawn, there)]
-        met, weight = 0.0, 0.0
-        for mesh_pixels, mask_pixels in pairs:
-            agree, size, wanted = (x.sum() for x in (mesh_pixels & mask_pixels, mesh_pixels, mask_pixels))
-            met += agree * min(1.0, agree / max(_LEAST_COVERED * wanted, 1.0))
-            weight += size if size else wanted
+            pairs = {"": (drawn, there)}
+        parts: dict[str, tuple[float, float]] = {}
+        for name, (mesh_pixels, mask_pixels) in pairs.items():
+            agree, size, wanted = (float(x.sum()) for x in (mesh_pixels & mask_pixels, mesh_pixels, mask_pixels))
+            parts[name] = agree * min(1.0, agree / max(_LEAST_COVERED * wanted, 1.0)), size if size else wanted
+        met, weight = np.sum(list(parts.values()), axis=0)
         misfit = 1.0 - met / weight if weight else 1.0
-        return _Fit(float(misfit), both / float(there.sum()), both / float(max((drawn | there).sum(), 1)))
+        fit = _Fit(float(misfit), both / float(there.sum()), both / float(max((drawn | there).sum(), 1)))
+        return fit, parts if view.labelled else {}
 
     @staticmethod
     def _step(camera: Camera) -> int:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nbavatar.errors import ConfigError, DataError, describe, did_you_mean, parsing
-from nbavatar.names import check_name
+from nbavatar.names import check_apart, check_name
 
 __all__ = ["StoredCamera", "choose_camera", "parse_camera", "read_rig", "stored_test_camera"]
 
@@ -89,7 +89,9 @@ def read_rig(path: str | os.PathLike[str]) -> dict[str, Any]:
     if not isinstance(stored, _Pairs) or not stored:
         found = "an empty mapping" if stored == [] and isinstance(stored, _Pairs) else type(stored).__name__
         raise DataError.of(path, expected="a mapping from camera name to its calibration", found=found)
-    return _mapping(stored, str(path))
+    cameras = _mapping(stored, str(path))
+    check_apart(cameras, path, "camera", error=DataError)
+    return cameras
 
 
 def parse_camera(name: str, entry: Any, path: str | os.PathLike[str]) -> StoredCamera:

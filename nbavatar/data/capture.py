@@ -30,7 +30,7 @@ from nbavatar.errors import DataError, describe, did_you_mean
 from nbavatar.io.arrays import read_arrays
 from nbavatar.io.pictures import read_colours
 from nbavatar.io.records import read_json
-from nbavatar.names import check_name
+from nbavatar.names import check_apart, check_name
 
 __all__ = [
     "Capture",
@@ -159,6 +159,8 @@ def read_splits(root: Path) -> Splits:
     runs = segments_of(frames, _cuts(stored, frames, path), str(path))
     chosen = {*train, *test}
     used = [not train or frame in chosen for frame in frames]
+    if set(test) >= {frame for frame, there in zip(frames, used) if there}:
+        raise DataError.of(path, "train", expected="a frame to train on at least", found="all frames in test")
     place = np.concatenate([[0], np.cumsum(used)])
     kept = [(int(place[first]), int(place[last + 1]) - 1) for first, last in runs]
     return Splits(
@@ -259,6 +261,7 @@ def _ids(stored: Mapping[str, Any], key: str, path: Path) -> list[str]:
     if len(set(ids)) != len(ids):
         twice = next(v for v, count in Counter(ids).items() if count > 1)
         raise DataError.of(path, key, expected="each frame once", found=f"'{twice}' twice")
+    check_apart(ids, path, key, error=DataError)
     return [check_name(frame, path, key, error=DataError) for frame in ids]
 
 

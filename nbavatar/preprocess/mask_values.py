@@ -131,15 +131,15 @@ class ValueSurvey:
                 fix = "store labels as png, or as a video without loss (ffv1 in mkv)"
                 found = f"{self._listed()} in a lossy format, which changes labels along every edge"
                 raise DataError.of(where, "values", expected=f"labels 0..{LABELS} or 0..255", found=found, fix=fix)
-            if top == 1 and set(parts) - {"head"}:
-                return Meaning("person", 1)
-            return Meaning("label", 0)
+            meaning = Meaning("person", 1) if top == 1 and set(parts) - {"head"} else Meaning("label", 0)
+            return self._with_background(meaning, where)
         if self._labelled and not self._lossy:
             found = f"{self._above} of {self._pictures} masks with values above 3, and labels in {self._labelled[0]}"
             raise DataError.of(where, expected="labels 0..3 in all masks, or 0..255 in all", found=found)
         few = self._few()
         expected = "labels 0..3, or a matte: 0, and one value for the person"
-        return Meaning("person", self._white(where, expected, _FEW_VALUES if few else _MANY_VALUES))
+        meaning = Meaning("person", self._white(where, expected, _FEW_VALUES if few else _MANY_VALUES))
+        return self._with_background(meaning, where)
 
     def coverage(self, where: object) -> Meaning:
         """Meaning of alpha images, which are mattes whatever their values.
@@ -148,7 +148,16 @@ class ValueSurvey:
             DataError: no matte.
         """
         expected = "coverage: 0, one value where it is full, and others for less of it"
-        return Meaning("person", self._white(where, expected, _COVERAGE) if self.largest else 255)
+        if not self.largest:
+            return Meaning("person", 255)
+        return self._with_background(Meaning("person", self._white(where, expected, _COVERAGE)), where)
+
+    def _with_background(self, meaning: Meaning, where: object) -> Meaning:
+        """The same meaning, if there is background in some picture: a person never fills all of them."""
+        if self._counts[: meaning.white // 2 + 1].sum() == 0:
+            found = f"none in {self._pictures} pictures"
+            raise DataError.of(where, "values", expected="background (0) somewhere", found=found, fix=_FIX)
+        return meaning
 
     def _few(self) -> bool:
         return not self._lossy and int((self._counts > 0).sum()) <= _FEW

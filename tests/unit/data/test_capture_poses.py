@@ -2,13 +2,14 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from nbavatar.checks.capture import check_capture
-from tests.scenes.solid import write_solid
+from tests.scenes.solid import FRAMES, write_solid
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -124,3 +125,75 @@ def test_a_camera_that_nobody_is_in_is_a_defect(solid, tmp_path):
         picture = np.array(Image.open(path)) * (path.parent.name != "near")
         Image.fromarray(picture.astype(np.uint8)).save(target)
     assert [line for line in check_capture(capture).defects if "masks/near: expected labelled pixels" in line]
+
+
+def pictures(change, *cameras, kinds=("images", "masks")):
+    """Edit of pictures, of all cameras where none is named."""
+
+    def edit(capture):
+        for path in (path for kind in kinds for path in capture.glob(f"{kind}/*/*.png")):
+            if not cameras or path.parent.name in cameras:
+                Image.fromarray(np.ascontiguousarray(change(np.array(Image.open(path))))).save(path)
+
+    return edit
+
+
+def renumbered(order, pattern):
+    """Edit after which frame i has the file of frame order[i]."""
+
+    def edit(capture):
+        for folder in capture.glob(pattern):
+            (suffix,) = {path.suffix for path in folder.glob("f*")}
+            kept = [(folder / f"{frame}{suffix}").read_bytes() for frame in FRAMES]
+            for frame, source in zip(FRAMES, order):
+                (folder / f"{frame}{suffix}").write_bytes(kept[source])
+
+    return edit
+
+
+def hand_elsewhere(capture):
+    for path in capture.glob("meshes/f*.npz"):
+        arrays = dict(np.load(path))
+        np.savez(path, **arrays | {"right_hand": arrays["right_hand"] + np.float32([0, 0.3, 0])})
+
+
+def alpha_only(capture):
+    shutil.move(capture / "masks/side", capture / "alpha/side")
+    pictures(lambda v: 255 * (v > 0).astype(np.uint8), kinds=["alpha"])(capture)
+
+
+def rig(edit):
+    def damage(capture):
+        cameras = json.loads((capture / "cameras.json").read_text())
+        edit(cameras)
+        (capture / "cameras.json").write_text(json.dumps(cameras))
+
+    return damage
+
+
+OTHER_PICTURES = {
+    "mirrored": (pictures(np.fliplr), r"in low, high, side, near; 100% would .* are mirrored: flip them left to right"),
+    "one mirrored": (pictures(np.fliplr, "side"), "there in side; 100% would .* are mirrored: flip them left to right"),
+    "one upside down": (pictures(lambda v: v[::-1, ::-1], "low"), "in low; .* are turned by 180 degrees"),
+    "masks a frame late": (renumbered([0, 0, 1, 2], "masks/*"), "same moment.* meshes of the frame before"),
+    "meshes a frame late": (renumbered([0, 0, 1, 2], "meshes"), "same moment.* meshes of the next frame"),
+    "meshes in reverse": (renumbered([3, 2, 1, 0], "meshes"), "same moment.* of the frame as far from the end"),
+    "a hand elsewhere": (hand_elsewhere, r"meshes: right_hand: expected vertices that project onto label 2"),
+    "a calibration twice": (rig(lambda c: c.update(near=c["high"])), "camera near: R, t: expected a pose of its own"),
+    "no light": (pictures(lambda v: v * 0, kinds=["images"]), "found one colour in all.*in low, high, side, near"),
+    "one picture": (renumbered([0, 0, 0, 0], "images/side"), "images/side: expected a film.* 4 times the same"),
+    "a camera without masks": (alpha_only, "masks/side: expected masks as of camera (high|low|near), found none"),
+    "everything is covered": (
+        pictures(lambda v: v * 0 + 255, "side", kinds=["masks"]), "masks/side: values: expected background",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", OTHER_PICTURES)
+def test_pictures_that_do_not_belong_to_the_meshes_are_said(solid, tmp_path, case):
+    edit, words = OTHER_PICTURES[case]
+    capture = tmp_path / "capture"
+    shutil.copytree(solid, capture)
+    edit(capture)
+    (line,) = [line for line in check_capture(capture).defects if "cameras.json: camera near: expected" not in line]
+    assert re.search(words, line) and "\n" not in line, line
