@@ -1,16 +1,20 @@
-"""The SLURM profile through a real SLURM of one node: devices, limits, retries, without accounting.
+"""The SLURM profile through a real SLURM of one node: devices, limits, retries, trainings that go on.
 
 Skipped where Debian's packages (tests/cluster/loopback.py) or the executor's package are not installed.
 """
 
 import importlib.util
+import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
+from nbavatar.io.tensors import read_tensors
 from tests.cluster.loopback import available, slurm
+from tests.scenes.toy import write_scene
 
 ROOT = Path(__file__).parents[2]
 pytestmark = [
@@ -20,6 +24,10 @@ pytestmark = [
         reason="SLURM, or snakemake-executor-plugin-slurm, is not installed",
     ),
 ]
+
+COMMAND = [sys.executable, "-m", "snakemake", "--workflow-profile", str(ROOT / "profiles/slurm"),
+           "--slurm-status-command", "squeue", "--slurm-no-account",
+           "--slurm-init-seconds-before-status-checks", "5"]  # fmt: skip
 
 # Rules of the names that the profile knows. A training is killed for its time in its first attempt, and goes on in its
 # second from what it has saved; a job is killed for its memory in its first.
@@ -62,13 +70,83 @@ def test_devices_limits_and_retries(tmp_path):
     (tmp_path / "Snakefile").write_text("import sys\n" + WORKFLOW)
     (tmp_path / "hold.py").write_text(HOLD)
     with slurm() as environment:
-        command = [sys.executable, "-m", "snakemake", "--workflow-profile", str(ROOT / "profiles/slurm"),
-                   "--slurm-status-command", "squeue", "--slurm-no-account",
-                   "--slurm-init-seconds-before-status-checks", "5"]  # fmt: skip
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        done = subprocess.run(COMMAND, cwd=tmp_path, env=environment, capture_output=True, text=True)
     said = done.stdout + done.stderr
     assert done.returncode == 0, said[-6000:]
     assert {(tmp_path / f"gpu{i}").read_text().strip() for i in range(3)} <= {"0", "1"}
     assert not list(tmp_path.glob("held.*"))
     for name in ("long", "large"):
         assert (tmp_path / name).read_text() == "x\nx\n", name  # the second attempt met what the first had left
+
+
+# Runs a training; in the first attempt stops it after a checkpoint, and gives SLURM a reason to end the job: the limit
+# of time, at whose SIGTERM the training is woken to save its state, or of memory, which ends it by SIGKILL.
+STOP = """
+import os, signal, subprocess, sys, time
+how, folder, *command = sys.argv[1:]
+training = subprocess.Popen(command)
+def told(*_):
+    training.send_signal(signal.SIGCONT)
+    training.terminate()
+signal.signal(signal.SIGTERM, told)
+mark = os.path.join(folder, "stopped")
+if how != "whole" and not os.path.exists(mark):
+    while not os.path.exists(os.path.join(folder, "model.pt.state", "state.pt")) and training.poll() is None:
+        time.sleep(0.01)
+    training.send_signal(signal.SIGSTOP)
+    with open(mark, "w") as stream:
+        stream.write(str(training.poll()))
+    if how == "memory":
+        held = bytearray(2300 << 20)
+sys.exit(training.wait())
+"""
+TRAININGS = """
+rule all:
+    input: expand("{how}/model.pt", how=["whole", "time", "memory"])
+
+rule train:
+    output: "{how}/model.pt"
+    retries: 2
+    resources:
+        mem="2GB",
+        runtime=lambda wildcards, attempt: 1 if wildcards.how == "time" and attempt == 1 else 30,
+    shell: "{PYTHON} stop.py {wildcards.how} {wildcards.how} {TRAIN} --out {output} >> attempts.{wildcards.how} 2>&1"
+"""
+OPTIONS = {
+    "steps": 150, "texels": 4, "unet": {"width": 4, "depth": 3, "max_width": 8, "convs": 1}, "weight_lpips": 0.0,
+    "previews": 0, "coarse_side": 16, "checkpoint_seconds": 0.5,
+}  # fmt: skip
+
+
+def weights(value, name=""):
+    """All tensors in what `torch.save` wrote, by their place."""
+    if isinstance(value, torch.Tensor):
+        return {name: value}
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, (list, tuple)) else ()
+    return {key: found for part, inner in pairs for key, found in weights(inner, f"{name}/{part}").items()}
+
+
+def test_a_training_that_the_scheduler_ends_goes_on_to_the_same_weights(tmp_path):
+    scene = write_scene(tmp_path / "scene")
+    train = [
+        sys.executable, "-m", "nbavatar", "train", "--device", "cpu", "--cfg", json.dumps(OPTIONS),
+        "--meshes", str(scene["meshes"]), "--spectral", str(scene["spectral"]),
+        "--frames", *map(str, scene["packs"][:2]),
+    ]  # fmt: skip
+    (tmp_path / "stop.py").write_text(STOP)
+    (tmp_path / "Snakefile").write_text(
+        f"import shlex\nPYTHON, TRAIN = {sys.executable!r}, shlex.join({train!r})\n{TRAININGS}"
+    )
+    with slurm() as environment:
+        done = subprocess.run(COMMAND, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        states = subprocess.check_output(["squeue", "--states=all", "--noheader", "--format=%T"], env=environment)
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said[-6000:]
+    ends = sorted(states.decode().split())
+    assert ends.count("COMPLETED") == 3 and "TIMEOUT" in ends and len(ends) == 5, ends
+    whole = weights(read_tensors(tmp_path / "whole/model.pt", "an avatar"))
+    assert whole
+    for how in ("time", "memory"):
+        assert (tmp_path / how / "stopped").read_text() == "None"  # it was at work then
+        found = weights(read_tensors(tmp_path / how / "model.pt", "an avatar"))
+        assert found.keys() == whole.keys() and all(torch.equal(found[name], whole[name]) for name in whole), how
