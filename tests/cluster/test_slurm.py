@@ -150,3 +150,34 @@ def test_a_training_that_the_scheduler_ends_goes_on_to_the_same_weights(tmp_path
         assert (tmp_path / how / "stopped").read_text() == "None"  # it was at work then
         found = weights(read_tensors(tmp_path / how / "model.pt", "an avatar"))
         assert found.keys() == whole.keys() and all(torch.equal(found[name], whole[name]) for name in whole), how
+
+
+@pytest.mark.skipif(not available(accounts=True), reason="slurmdbd and MariaDB are not installed")
+def test_a_site_with_accounts_needs_no_further_options(tmp_path):
+    """Account and states of jobs come from the accounting database then."""
+    (tmp_path / "Snakefile").write_text(ACCOUNTED)
+    with slurm(accounts=True) as environment:
+        command = [*COMMAND[:5], "--slurm-init-seconds-before-status-checks", "5"]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        said = done.stdout + done.stderr
+        assert done.returncode == 0, said[-6000:]
+        rows = subprocess.check_output(
+            ["sacct", "-X", "--noheader", "--parsable2", "--format=Account,State"], env=environment, text=True
+        )
+    assert sorted(rows.split()) == ["root|COMPLETED", "root|COMPLETED", "root|FAILED"]
+
+
+ACCOUNTED = """
+rule all:
+    input: "b"
+
+rule a:
+    output: "a"
+    shell: "echo a > {output}"
+
+rule b:
+    input: "a"
+    output: "b"
+    retries: 1
+    shell: "echo x >> tried; test $(wc -l < tried) -gt 1; cp a {output}"
+"""
