@@ -22,7 +22,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from nbavatar.cli.run_words import check_files, profile_files, read_words
+from nbavatar.cli.run_words import check_files, executor_of, profile_files, read_words
 from nbavatar.cli.supervision import run_workflow, wait
 from nbavatar.errors import DataError, DependencyError
 from nbavatar.io.atomic import atomic_write
@@ -78,8 +78,10 @@ def main(args: argparse.Namespace) -> int:
         if code:
             return code
     given = read_words(args.snakemake)
+    slurm = executor_of(given, source, args.profile or "") == "slurm"
+    warm = args.what == "smoke" and args.profile is None and not given.profiles
     # The jobs of the smoke run take a second or two each: the profile and `nbavatar warm` are for such.
-    code = run_workflow(words, warm=args.what == "smoke" and args.profile is None and not given.profiles)
+    code = run_workflow(words, warm=warm, slurm=slurm)
     report = here / "results" / args.what / "report" / "index.html"
     if code == 0 and report.is_file() and not args.snakemake:
         if args.what == "smoke":

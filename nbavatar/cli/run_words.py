@@ -16,7 +16,7 @@ from nbavatar.config.run import load_run
 from nbavatar.config.yamlfiles import check_tree, parse_yaml
 from nbavatar.errors import ConfigError, describe, parsing
 
-__all__ = ["Words", "check_files", "profile_files", "read_words"]
+__all__ = ["Words", "check_files", "executor_of", "profile_files", "read_words"]
 
 _EXPECTED = "a configuration in YAML"
 
@@ -30,12 +30,14 @@ class Words:
         values: KEY=VALUE of `--config`.
         profiles: names or paths of `--profile` and `--workflow-profile`.
         snakefile: another workflow than ours, or empty.
+        executor: where jobs run, or empty.
     """
 
     configfiles: tuple[str, ...]
     values: tuple[str, ...]
     profiles: tuple[str, ...]
     snakefile: str
+    executor: str
 
 
 class _Parser(argparse.ArgumentParser):
@@ -55,9 +57,25 @@ def read_words(words: Sequence[str]) -> Words:
     parser.add_argument("--profile", action="append", default=[])
     parser.add_argument("--workflow-profile", default="none")
     parser.add_argument("--snakefile", "-s", default="")
+    parser.add_argument("--executor", "-e", default="")
     found, _ = parser.parse_known_args(list(words))
     profiles = [name for name in (*found.profile, found.workflow_profile) if name != "none"]
-    return Words(tuple(found.configfile), tuple(found.config), tuple(profiles), found.snakefile)
+    return Words(tuple(found.configfile), tuple(found.config), tuple(profiles), found.snakefile, found.executor)
+
+
+def executor_of(words: Words, source: Path, profile: str = "") -> str:
+    """Snakemake's executor: that of the words, else that of the last profile that names one, else empty.
+
+    Args:
+        words: of the user.
+        source: folder of our workflow.
+        profile: a further profile, that comes last.
+    """
+    found = ""
+    for name in filter(None, (*words.profiles, profile)):
+        for path in profile_files(name, source):
+            found = str(_mapping(path).get("executor", found))
+    return words.executor or found
 
 
 def check_files(words: Words, configfiles: Sequence[str], source: Path) -> None:

@@ -5,6 +5,8 @@ killed the others live on and write, beside the next run. So all of them carry a
 (`NBAVATAR_RUN`), and whatever carries it is ended when this process ends its work; if this process is itself
 killed, by a guard that waits for nothing else; and by the next run in the same folder in any case.
 
+Jobs that it gave to SLURM are on other machines: they have the token in their names, and are cancelled then.
+
 A killed Snakemake also leaves its lock. The next run removes it if the run that left it is known, was of this machine,
 and is gone; else it says which command removes it.
 """
@@ -22,6 +24,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from nbavatar.cli.slurm_jobs import PREFIX_OPTION, cancel_jobs
 from nbavatar.errors import DataError
 from nbavatar.io.records import write_json
 from nbavatar.processes import alive, machine
@@ -48,12 +51,15 @@ _HARMLESS = {
 }  # fmt: skip
 
 
-def run_workflow(snakemake: Sequence[str], *, warm: bool = False, folder: str | os.PathLike[str] = ".") -> int:
+def run_workflow(
+    snakemake: Sequence[str], *, warm: bool = False, slurm: bool = False, folder: str | os.PathLike[str] = "."
+) -> int:
     """Runs Snakemake as the only run of its folder; returns its exit code.
 
     Args:
         snakemake: the command, such as `[sys.executable, "-m", "snakemake", "--cores", "2"]`.
         warm: run it below `nbavatar warm`.
+        slurm: its jobs go to SLURM.
         folder: Snakemake's working folder; must be the current one unless the command says otherwise.
 
     Raises:
@@ -63,10 +69,12 @@ def run_workflow(snakemake: Sequence[str], *, warm: bool = False, folder: str | 
     if _HARMLESS & set(snakemake):
         return wait(subprocess.Popen(command))
     token = f"{machine()}-{os.getpid()}-{secrets.token_hex(8)}"
-    with _claimed(Path(folder).resolve() / ".snakemake", snakemake, token):
+    if slurm:
+        command += [PREFIX_OPTION, token]
+    with _claimed(Path(folder).resolve() / ".snakemake", snakemake, token, slurm):
         # Below `nbavatar warm` it is that which interrupts Snakemake.
         order = (signal.SIGTERM, signal.SIGKILL) if warm else _ORDER
-        with supervised(command, os.environ, token, order) as process:
+        with supervised(command, os.environ, token, order, slurm) as process:
             return wait(process)
 
 
@@ -76,6 +84,7 @@ def supervised(
     environment: Mapping[str, str],
     token: str | None = None,
     order: Sequence[signal.Signals] = _ORDER,
+    slurm: bool = False,
 ) -> Iterator["subprocess.Popen[bytes]"]:
     """Starts a command; when the block ends, nothing of what the command started is left.
 
@@ -87,6 +96,7 @@ def supervised(
         environment: of the command.
         token: of the run; a new one by default, and inside another run that run's.
         order: signals that end the command, each when the one before has not.
+        slurm: whether jobs of the run are in SLURM's queue.
     """
     outer = os.environ.get(RUN_VARIABLE) if token is None else None
     token = outer or token or f"{machine()}-{os.getpid()}-{secrets.token_hex(8)}"
@@ -94,7 +104,7 @@ def supervised(
     # Noted, not raised: an exception out of a handler is lost where the interpreter runs hooks, as around a fork.
     former = signal.signal(signal.SIGTERM, lambda *_: _TOLD.append(signal.SIGTERM))
     # The outer run has a guard, and ends what is left of this one.
-    guard = contextlib.nullcontext() if outer else _guarded(token)
+    guard = contextlib.nullcontext() if outer else _guarded(token, slurm)
     try:
         with guard:
             process = subprocess.Popen(command, env={**environment, RUN_VARIABLE: token})
@@ -105,6 +115,8 @@ def supervised(
                 _end(process, order)
                 if not outer:
                     end_run(token)
+                    if slurm:
+                        cancel_jobs(token)
     finally:
         signal.signal(signal.SIGTERM, former)
 
@@ -183,7 +195,7 @@ def _end(process: "subprocess.Popen[bytes]", order: Sequence[signal.Signals]) ->
 
 
 @contextlib.contextmanager
-def _guarded(token: str) -> Iterator[None]:
+def _guarded(token: str, slurm: bool) -> Iterator[None]:
     """While the block lasts, a process waits for the end of this one, and then ends the run."""
     reading, writing = os.pipe()
     guard = os.fork()
@@ -200,6 +212,8 @@ def _guarded(token: str) -> Iterator[None]:
                 signal.signal(number, signal.SIG_IGN)
             if os.read(3, 1) == b"":
                 end_run(token)
+                if slurm:
+                    cancel_jobs(token)
             status = 0
         finally:
             os._exit(status)
@@ -222,7 +236,7 @@ def leave_guard() -> None:
 
 
 @contextlib.contextmanager
-def _claimed(state: Path, snakemake: Sequence[str], token: str) -> Iterator[None]:
+def _claimed(state: Path, snakemake: Sequence[str], token: str, slurm: bool) -> Iterator[None]:
     """Makes this run the only one of Snakemake's folder, after what a killed one left is cleared away."""
     record, locks = state / _RECORD, state / "locks"
     former = _former(record)
@@ -233,6 +247,7 @@ def _claimed(state: Path, snakemake: Sequence[str], token: str) -> Iterator[None
         orphans = end_run(former["run"])
         if orphans:
             print(f"nbavatar: ended {orphans} processes that a killed run had left", file=sys.stderr)
+        _cancel_former(former, state.parent)
     left = sorted(path.name for path in locks.glob("*.lock"))
     if left:
         known = former is not None and former["machine"] == machine()
@@ -242,7 +257,8 @@ def _claimed(state: Path, snakemake: Sequence[str], token: str) -> Iterator[None
             raise DataError.of(state.parent, expected="no lock of Snakemake", found=found, fix=fix)
         shutil.rmtree(locks)
         print(f"nbavatar: removed the lock of process {former['process']}, which was killed", file=sys.stderr)
-    own = {"machine": machine(), "process": os.getpid(), "started": _started(os.getpid()), "run": token}
+    own = {"machine": machine(), "process": os.getpid(), "started": _started(os.getpid()), "run": token,
+           "slurm": slurm}  # fmt: skip
     write_json(record, own)
     try:
         yield
@@ -258,11 +274,25 @@ def _claimed(state: Path, snakemake: Sequence[str], token: str) -> Iterator[None
             record.unlink(missing_ok=True)
 
 
+def _cancel_former(former: dict[str, Any], folder: Path) -> None:
+    """Ends the jobs that a killed run has in SLURM's queue: they would write beside the next one's."""
+    if not former["slurm"]:
+        return
+    count = cancel_jobs(former["run"])
+    if count is None:
+        fix = f"when SLURM answers, cancel the jobs whose names begin with {former['run']} (squeue, scancel)"
+        raise DataError.of(folder, expected="no jobs of a killed run in SLURM's queue", found="that it may have some",
+                           fix=f"{fix} and remove .snakemake/{_RECORD}")  # fmt: skip
+    if count:
+        print(f"nbavatar: cancelled {count} jobs that a killed run had in SLURM's queue", file=sys.stderr)
+
+
 def _former(record: Path) -> dict[str, Any] | None:
     try:
         content = json.loads(record.read_text(encoding="utf-8"))
         return {"machine": str(content["machine"]), "process": int(content["process"]),
-                "started": content["started"] and float(content["started"]), "run": str(content["run"])}  # fmt: skip
+                "started": content["started"] and float(content["started"]), "run": str(content["run"]),
+                "slurm": content.get("slurm") is True}  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

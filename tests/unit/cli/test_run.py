@@ -19,7 +19,8 @@ def calls(monkeypatch):
     """Commands that would run; each ends well."""
     seen: list[list[str]] = []
 
-    def call(words, *, warm):
+    def call(words, *, warm, slurm):
+        assert slurm == any("slurm" in word for word in words)
         seen.append([*(["warm"] if warm else []), *words])
         return 0
 

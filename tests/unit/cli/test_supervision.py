@@ -25,6 +25,9 @@ if "--again" in sys.argv:
 locks.mkdir(parents=True)
 for kind in ("input", "output"):
     (locks / f"0.{kind}.lock").write_text("results/a")
+if "--slurm-jobname-prefix" in sys.argv:
+    name = sys.argv[sys.argv.index("--slurm-jobname-prefix") + 1]
+    pathlib.Path("queue").write_text(f"7|{name}_1\n8|another\n9|{name}_1\n")
 job = "import os, time\nwhile True:\n open('job', 'w').write(str(os.getpid()))\n time.sleep(0.05)"
 shell = subprocess.Popen(["bash", "-c", 'set -e; "$0" -c "$1"; true', sys.executable, job])
 pathlib.Path("snakemake").write_text(str(os.getpid()))
@@ -38,12 +41,13 @@ finally:
     locks.rmdir()
 """
 LAUNCHER = """
-import sys
+import os, sys
 from nbavatar.cli import supervision
 from nbavatar.errors import NBAvatarError
 supervision._GRACE_S = 3.0
 try:
-    sys.exit(supervision.run_workflow([sys.executable, "-m", "snakemake", *sys.argv[1:]]))
+    words = [sys.executable, "-m", "snakemake", *sys.argv[1:]]
+    sys.exit(supervision.run_workflow(words, slurm=os.path.exists("squeue")))
 except NBAvatarError as error:
     sys.exit(f"line: {error}")
 """
@@ -118,6 +122,35 @@ def test_a_killed_run_without_its_guard_is_ended_by_the_next(start, tmp_path):
     assert again.returncode == 0, error
     assert "ended 3 processes that a killed run had left" in error  # Snakemake, the shell, the job
     gone(*processes)
+
+
+def test_jobs_of_a_killed_run_in_the_queue_are_cancelled_and_no_others(start, tmp_path, monkeypatch):
+    """By the guard, and, where that was killed too, by the next run; which does not start where it cannot know."""
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    queue = tmp_path / "queue"
+    for name, script in (("squeue", "cat queue"), ("scancel", r'for job; do sed -i "/^$job|/d" queue; done')):
+        (tmp_path / name).write_text(f"#!/bin/sh\ncd {tmp_path} || exit\n{script}\n")
+        (tmp_path / name).chmod(0o755)
+    run = start()
+    processes = at_work(tmp_path)
+    run.kill()
+    gone(*processes)
+    until(lambda: queue.read_text() == "8|another\n")
+    assert start("--again").wait(PATIENCE_S) == 0
+    run = start()
+    processes = at_work(tmp_path)
+    for child in psutil.Process(run.pid).children():
+        if child.pid != processes[0]:
+            child.kill()
+    run.kill()
+    run.wait()
+    (tmp_path / "squeue").write_text("#!/bin/sh\nexit 1\n")
+    _, error = (again := start("--again")).communicate(timeout=PATIENCE_S)
+    assert again.returncode == 1 and "whose names begin with" in error
+    (tmp_path / "squeue").write_text(f"#!/bin/sh\ncat {queue}\n")
+    _, error = (again := start("--again")).communicate(timeout=PATIENCE_S)
+    assert again.returncode == 0 and "cancelled 2 jobs that a killed run had" in error, error
+    assert queue.read_text() == "8|another\n"
 
 
 def test_a_killed_snakemake_takes_its_jobs_along_and_its_lock_is_removed(start, tmp_path):
