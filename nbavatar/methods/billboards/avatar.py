@@ -27,6 +27,7 @@ from nbavatar.rendering.billboards.functional import render_billboards
 
 __all__ = ["Anchor", "Architecture", "Avatar", "Window"]
 
+_MOST_TEXELS, _DEEPEST = 64, 16  # the options allow no more
 _DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
@@ -322,6 +323,7 @@ class Avatar(MeshAvatar):
     def rebuild(cls, content: Mapping[str, Any], state: Mapping[str, Tensor], record: Mapping[str, Any]) -> "Avatar":
         """An avatar of the stored shape, its values still to be loaded."""
         architecture = Architecture(**content["architecture"])
+        _check_stored(architecture, content["refinement"], state)
         if "billboards.sizes" in state:
             billboards = SizedBillboards.of_state(architecture.texels, state, "billboards.")
         else:
@@ -338,6 +340,27 @@ class Avatar(MeshAvatar):
             refinement=_empty_refinement(content["refinement"], state),
             record=record,
         )
+
+
+def _check_stored(a: Architecture, refinement: Mapping[str, Any] | None, state: Mapping[str, Tensor]) -> None:
+    """Compares the sizes that a file names with the tensors that are there, before anything is made of such a size.
+
+    Raises:
+        ValueError: they disagree.
+    """
+    if not (0 < a.texels <= _MOST_TEXELS and 0 < a.unet_depth <= _DEEPEST and 0 < a.unet_convs <= _DEEPEST):
+        raise ValueError(f"{a.texels} texels, {a.unet_depth} stages of {a.unet_convs} convolutions")
+    if a.deferred:
+        with torch.device("meta"):  # shapes without memory
+            unet = UNet(a.channels + 1, width=a.unet_width, depth=a.unet_depth, max_width=a.unet_max_width,
+                        convs=a.unet_convs)  # fmt: skip
+        for name, value in unet.state_dict().items():
+            if state[f"unet.{name}"].shape != value.shape:
+                raise ValueError(f"unet.{name} of {list(state[f'unet.{name}'].shape)} instead of {list(value.shape)}")
+    if refinement is not None:
+        for name, value in state.items():
+            if name.startswith("refinement.bend_") and len(value) != len(refinement["frames"]):
+                raise ValueError(f"{name} of {len(value)} frames instead of {len(refinement['frames'])}")
 
 
 def _empty_refinement(described: Mapping[str, Any] | None, state: Mapping[str, Tensor]) -> Refinement | None:

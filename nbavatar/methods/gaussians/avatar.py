@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from nbavatar.math.rotations import normalize_quaternion, quaternion_to_matrix
 from nbavatar.methods.base import MeshAvatar, Stages
 from nbavatar.rendering.gaussians.functional import SplatImage, render_gaussians
-from nbavatar.rendering.gaussians.spherical_harmonics import harmonic_count
+from nbavatar.rendering.gaussians.spherical_harmonics import DEGREES, harmonic_count
 
 __all__ = ["GaussianAvatar", "PosedGaussians"]
 
@@ -68,6 +68,8 @@ class GaussianAvatar(MeshAvatar):
     ) -> None:
         """Args: log_scale (N, 3) and colour (N, 3) in degree 0 at the start, equal opacities, no rotation."""
         super().__init__(faces, vertex_counts, record)
+        if sh_degree not in DEGREES:
+            raise ValueError(f"harmonics of degree {sh_degree}")
         count = len(log_scale)
         quat = torch.zeros(count, 4)
         quat[:, 0] = 1.0
@@ -187,6 +189,8 @@ class GaussianAvatar(MeshAvatar):
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Takes over what `state_dict` gave, whatever its number of Gaussians."""
         device = self.faces.device
+        if not 0 <= int(state["degree"]) <= self.sh_degree:
+            raise ValueError(f"harmonics of degree {int(state['degree'])} of {self.sh_degree}")
         for name in self.PARAMETERS:
             setattr(self, name, nn.Parameter(torch.empty_like(state[name], device=device)))
         for name in self.BUFFERS:

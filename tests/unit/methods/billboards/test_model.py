@@ -92,6 +92,25 @@ def test_load_refuses_what_is_not_an_avatar(tmp_path) -> None:
         load_avatar(tmp_path / "cut.pt")
 
 
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {"unet_width": 6000, "unet_max_width": 6000},  # 26 GB of weights
+        {"unet_convs": 10**9},
+        {"unet_depth": 10**9},
+        {"texels": 10**6},
+        {"channels": 10**7},
+    ],
+)
+def test_sizes_that_the_tensors_do_not_have_are_refused_before_anything_is_made(tmp_path, sizes) -> None:
+    save_avatar(tmp_path / "model.pt", make_avatar())
+    content = torch.load(tmp_path / "model.pt", weights_only=True)
+    content["architecture"] |= sizes
+    torch.save(content, tmp_path / "model.pt")
+    with pytest.raises(DataError, match="expected a whole avatar, found contents that disagree"):
+        load_avatar(tmp_path / "model.pt")
+
+
 def test_load_never_runs_code_from_a_file(tmp_path) -> None:
     class Hostile:
         def __reduce__(self):

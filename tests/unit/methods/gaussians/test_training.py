@@ -11,6 +11,7 @@ from nbavatar.config.core import to_mapping
 from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import MeshSequence, Part, read_sequence
 from nbavatar.data.views import ViewStore, views_of
+from nbavatar.errors import DataError
 from nbavatar.io.framepack import FramePack
 from nbavatar.methods.create import create_method
 from nbavatar.methods.gaussian_avatars.options import GaussianAvatarsConfig, GaussianAvatarsRates
@@ -202,6 +203,10 @@ def test_saved_and_loaded_it_renders_the_same(scene, tmp_path, config) -> None:
     method, _ = run(scene, config, tmp_path / "state")
     avatar, meshes = method.avatar.eval(), method_meshes(scene)
     save_avatar(tmp_path / "model.pt", avatar)
+    content = torch.load(tmp_path / "model.pt", weights_only=True)
+    torch.save(content | {"sh_degree": 10**5}, tmp_path / "degree.pt")
+    with pytest.raises(DataError, match="harmonics of degree 100000"):  # 120 GB, asked for one Gaussian
+        load_avatar(tmp_path / "degree.pt")
     again = load_avatar(tmp_path / "model.pt")
     assert type(again) is type(avatar) and again.primitives == avatar.primitives
     verts = {part: torch.from_numpy(meshes.parts[part].verts[1]) for part in avatar.parts}
