@@ -16,15 +16,15 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, models, register_model
 
 __all__ = [
-    "LANES", "any_lane", "bits", "choose", "count_bits", "count_trailing_zeros", "first_lanes", "floor", "gather",
-    "gather_pairs", "is_nan", "lane_numbers", "lanes_of", "largest", "load", "load_where", "maximum", "minimum", "ramp",
-    "spread", "store", "store_where", "stream", "to_int", "to_real", "total", "transpose", "truths",
+    "LANES", "Lanes", "any_lane", "broadcast", "count_bits", "count_trailing_zeros", "first_lanes", "floor", "is_nan",
+    "lane_numbers", "largest_lane", "mask_bits", "mask_to_int", "maximum", "minimum", "ramp", "select", "set_lanes",
+    "sum_lanes", "to_int", "to_real", "transpose",
 ]  # fmt: skip
 
 LANES = 8
-_I32, _I64, _WORD = ir.IntType(32), ir.IntType(64), ir.IntType(LANES)
+I32, I64, _WORD = ir.IntType(32), ir.IntType(64), ir.IntType(LANES)
 _ELEMENTS = {
-    "float32": ir.FloatType(), "float64": ir.DoubleType(), "int32": _I32, "int64": _I64, "mask": ir.IntType(1),
+    "float32": ir.FloatType(), "float64": ir.DoubleType(), "int32": I32, "int64": I64, "mask": ir.IntType(1),
 }  # fmt: skip
 _SCALARS = {"float32": types.float32, "float64": types.float64, "int32": types.int32, "int64": types.int64}
 
@@ -48,10 +48,10 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(dmm, fe_type, ir.VectorType(_ELEMENTS[fe_type.element], LANES))
 
 
-_MASK, _WHOLE = Lanes("mask"), Lanes("int32")
+MASK, INTS = Lanes("mask"), Lanes("int32")
 
 
-def _of(number: Any) -> Lanes:
+def lanes_type(number: Any) -> Lanes:
     """Lanes of a scalar's type."""
     return Lanes(str(number))
 
@@ -69,7 +69,7 @@ def _operators() -> None:
             def generic(self, args: Any, kws: Any) -> Any:
                 if len(args) != 2 or not isinstance(args[0], Lanes) or args[0] != args[1]:
                     return None
-                return signature(_MASK if symbol in compared else args[0], *args)
+                return signature(MASK if symbol in compared else args[0], *args)
 
         infer_global(symbol)(Typing)
 
@@ -102,44 +102,34 @@ _operators()
 
 def _splat(builder: Any, value: Any) -> Any:
     kind = ir.VectorType(value.type, LANES)
-    single = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_I32, 0))
-    zeros = ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES)
+    single = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(I32, 0))
+    zeros = ir.Constant(ir.VectorType(I32, LANES), [0] * LANES)
     return builder.shuffle_vector(single, ir.Constant(kind, ir.Undefined), zeros)
 
 
 def _numbers() -> Any:
-    return ir.Constant(ir.VectorType(_I32, LANES), list(range(LANES)))
+    return ir.Constant(ir.VectorType(I32, LANES), list(range(LANES)))
 
 
-def _call(builder: Any, name: str, result: Any, arguments: list[Any]) -> Any:
+def call_intrinsic(builder: Any, name: str, result: Any, arguments: list[Any]) -> Any:
     kind = ir.FunctionType(result, [argument.type for argument in arguments])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
 
 
-def _shuffle(builder: Any, a: Any, b: Any, chosen: Any) -> Any:
+def shuffle(builder: Any, a: Any, b: Any, chosen: Any) -> Any:
     picks = list(chosen)
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(picks)), picks))
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(picks)), picks))
 
 
-def _suffix(kind: Any) -> str:
+def suffix(kind: Any) -> str:
     element = kind.element
     return f"v{kind.count}" + ("f32" if element == ir.FloatType() else "f64" if element == ir.DoubleType() else "i32")
 
 
-def _size(kind: Any) -> int:
-    return 8 if kind.element in (ir.DoubleType(), _I64) else 4
-
-
-def _row(context: Any, builder: Any, base: Any, index: Any, number: Any) -> tuple[Any, Any]:
-    """Address of LANES numbers as a pointer to a vector, and the vector's type."""
-    kind = ir.VectorType(context.get_value_type(number), LANES)
-    return builder.bitcast(builder.gep(base, [index]), kind.as_pointer()), kind
-
-
 @intrinsic
-def spread(typingctx: Any, value: Any) -> Any:
+def broadcast(typingctx: Any, value: Any) -> Any:
     """One number in all lanes."""
-    return _of(value)(value), lambda context, builder, sig, args: _splat(builder, args[0])
+    return lanes_type(value)(value), lambda context, builder, sig, args: _splat(builder, args[0])
 
 
 @intrinsic
@@ -147,13 +137,13 @@ def ramp(typingctx: Any, like: Any) -> Any:
     """The numbers 0, 1, 2 ... in the type of the argument."""
     kind = ir.VectorType(_ELEMENTS[str(like)], LANES)
     constant = ir.Constant(kind, [float(i) for i in range(LANES)])
-    return _of(like)(like), lambda context, builder, sig, args: constant
+    return lanes_type(like)(like), lambda context, builder, sig, args: constant
 
 
 @intrinsic
 def lane_numbers(typingctx: Any) -> Any:
     """The int32 numbers 0, 1, 2 ..."""
-    return _WHOLE(), lambda context, builder, sig, args: _numbers()
+    return INTS(), lambda context, builder, sig, args: _numbers()
 
 
 @intrinsic
@@ -161,114 +151,9 @@ def first_lanes(typingctx: Any, count: Any) -> Any:
     """Mask of the first `count` lanes."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.icmp_signed("<", _numbers(), _splat(builder, builder.trunc(args[0], _I32)))
+        return builder.icmp_signed("<", _numbers(), _splat(builder, builder.trunc(args[0], I32)))
 
-    return _MASK(types.int64), generate
-
-
-@intrinsic
-def load(typingctx: Any, base: Any, index: Any) -> Any:
-    """Lanes from `index` on."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address, kind = _row(context, builder, *args, base.dtype)
-        return builder.load(address, align=_size(kind))
-
-    return _of(base.dtype)(base, types.intp), generate
-
-
-@intrinsic
-def store(typingctx: Any, base: Any, index: Any, value: Any) -> Any:
-    """Writes lanes from `index` on."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address, kind = _row(context, builder, args[0], args[1], base.dtype)
-        builder.store(args[2], address, align=_size(kind))
-        return context.get_dummy_value()
-
-    return types.none(base, types.intp, _of(base.dtype)), generate
-
-
-@intrinsic
-def stream(typingctx: Any, base: Any, index: Any, value: Any) -> Any:
-    """Writes lanes from `index` on past the caches; their address is a multiple of their size."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address, kind = _row(context, builder, args[0], args[1], base.dtype)
-        written = builder.store(args[2], address, align=LANES * _size(kind))
-        written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(_I32, 1)]))
-        return context.get_dummy_value()
-
-    return types.none(base, types.intp, _of(base.dtype)), generate
-
-
-@intrinsic
-def load_where(typingctx: Any, base: Any, index: Any, mask: Any) -> Any:
-    """Lanes from `index` on; those not in the mask are 0 and their memory is not touched."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address, kind = _row(context, builder, args[0], args[1], base.dtype)
-        aligned = ir.Constant(_I32, _size(kind))
-        arguments = [address, aligned, args[2], ir.Constant(kind, None)]
-        return _call(builder, f"llvm.masked.load.{_suffix(kind)}.p0", kind, arguments)
-
-    return _of(base.dtype)(base, types.intp, _MASK), generate
-
-
-@intrinsic
-def store_where(typingctx: Any, base: Any, index: Any, value: Any, mask: Any) -> Any:
-    """Writes the lanes of the mask from `index` on."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address, kind = _row(context, builder, args[0], args[1], base.dtype)
-        arguments = [args[2], address, ir.Constant(_I32, _size(kind)), args[3]]
-        _call(builder, f"llvm.masked.store.{_suffix(kind)}.p0", ir.VoidType(), arguments)
-        return context.get_dummy_value()
-
-    return types.none(base, types.intp, _of(base.dtype), _MASK), generate
-
-
-def _wide(builder: Any, offset: Any, lane: int) -> Any:
-    return builder.zext(builder.extract_element(offset, ir.Constant(_I32, lane)), _I64)
-
-
-@intrinsic
-def gather(typingctx: Any, base: Any, offset: Any) -> Any:
-    """Elements at int32 offsets from a pointer, none of them negative.
-
-    One load a lane: the processors' own gather instructions are slower than that where they are mended
-    against leaks between programs.
-    """
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value = ir.Constant(ir.VectorType(context.get_value_type(base.dtype), LANES), ir.Undefined)
-        for lane in range(LANES):
-            place = builder.gep(args[0], [_wide(builder, args[1], lane)])
-            value = builder.insert_element(value, builder.load(place), ir.Constant(_I32, lane))
-        return value
-
-    return _of(base.dtype)(base, _WHOLE), generate
-
-
-@intrinsic
-def gather_pairs(typingctx: Any, base: Any, offset: Any) -> Any:
-    """Elements at int32 offsets from a pointer, none of them negative, and those after them."""
-    lanes = _of(base.dtype)
-    both = types.UniTuple(lanes, 2)
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        number = context.get_value_type(base.dtype)
-        pair = ir.VectorType(number, 2)
-        parts = []
-        for lane in range(LANES):
-            place = builder.gep(args[0], [_wide(builder, args[1], lane)])
-            parts.append(builder.load(builder.bitcast(place, pair.as_pointer()), align=4))
-        while len(parts) > 2:
-            parts = [_shuffle(builder, a, b, range(2 * a.type.count)) for a, b in zip(parts[::2], parts[1::2])]
-        split = [_shuffle(builder, *parts, range(start, 2 * LANES, 2)) for start in (0, 1)]
-        return context.make_tuple(builder, both, split)
-
-    return both(base, _WHOLE), generate
+    return MASK(types.int64), generate
 
 
 @intrinsic
@@ -286,7 +171,7 @@ def transpose(typingctx: Any, rows: Any) -> Any:
                 a, b = values[i], values[i + distance]
                 upper = [j if not j & distance else LANES + j - distance for j in range(LANES)]
                 lower = [j + distance if not j & distance else LANES + j for j in range(LANES)]
-                swapped[i], swapped[i + distance] = _shuffle(builder, a, b, upper), _shuffle(builder, a, b, lower)
+                swapped[i], swapped[i + distance] = shuffle(builder, a, b, upper), shuffle(builder, a, b, lower)
             values = swapped
             distance *= 2
         return context.make_tuple(builder, sig.return_type, values)
@@ -295,9 +180,9 @@ def transpose(typingctx: Any, rows: Any) -> Any:
 
 
 @intrinsic
-def choose(typingctx: Any, mask: Any, yes: Any, no: Any) -> Any:
+def select(typingctx: Any, mask: Any, yes: Any, no: Any) -> Any:
     """`yes` in the lanes of the mask, `no` in the others."""
-    return yes(_MASK, yes, yes), lambda context, builder, sig, args: builder.select(*args)
+    return yes(MASK, yes, yes), lambda context, builder, sig, args: builder.select(*args)
 
 
 def _extreme(sign: str) -> Any:
@@ -319,7 +204,7 @@ def floor(typingctx: Any, a: Any) -> Any:
     """Greatest whole number below, as a float."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _call(builder, f"llvm.floor.{_suffix(args[0].type)}", args[0].type, [args[0]])
+        return call_intrinsic(builder, f"llvm.floor.{suffix(args[0].type)}", args[0].type, [args[0]])
 
     return a(a), generate
 
@@ -329,48 +214,48 @@ def to_int(typingctx: Any, a: Any) -> Any:
     """Whole floating-point numbers as int32."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.fptosi(args[0], ir.VectorType(_I32, LANES))
+        return builder.fptosi(args[0], ir.VectorType(I32, LANES))
 
-    return _WHOLE(a), generate
+    return INTS(a), generate
 
 
 @intrinsic
 def to_real(typingctx: Any, whole: Any, like: Any) -> Any:
     """int32 as numbers of the type of the second argument."""
     kind = ir.VectorType(_ELEMENTS[str(like)], LANES)
-    return _of(like)(_WHOLE, like), lambda context, builder, sig, args: builder.sitofp(args[0], kind)
+    return lanes_type(like)(INTS, like), lambda context, builder, sig, args: builder.sitofp(args[0], kind)
 
 
 @intrinsic
 def is_nan(typingctx: Any, a: Any) -> Any:
     """Mask of the lanes that hold no number."""
-    return _MASK(a), lambda context, builder, sig, args: builder.fcmp_unordered("uno", args[0], args[0])
+    return MASK(a), lambda context, builder, sig, args: builder.fcmp_unordered("uno", args[0], args[0])
 
 
 @intrinsic
-def bits(typingctx: Any, mask: Any) -> Any:
+def mask_bits(typingctx: Any, mask: Any) -> Any:
     """A mask as an int64, lane 0 in the lowest bit."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.zext(builder.bitcast(args[0], _WORD), _I64)
+        return builder.zext(builder.bitcast(args[0], _WORD), I64)
 
-    return types.int64(_MASK), generate
+    return types.int64(MASK), generate
 
 
 @intrinsic
-def lanes_of(typingctx: Any, word: Any) -> Any:
-    """The numbers of the lanes in a mask's `bits`, one behind the other, and then zeros: int32."""
+def set_lanes(typingctx: Any, word: Any) -> Any:
+    """The numbers of the lanes set in the `mask_bits` of a mask, one behind the other, and then zeros: int32."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         small = ir.VectorType(ir.IntType(8), LANES)
         table = ir.ArrayType(small, 1 << LANES)
         held = [[lane for lane in range(LANES) if word >> lane & 1] for word in range(1 << LANES)]
         rows = [ir.Constant(small, (lanes + [0] * LANES)[:LANES]) for lanes in held]
-        base = cgutils.global_constant(builder, "lanes_of", ir.Constant(table, rows))
-        row = builder.load(builder.gep(base, [ir.Constant(_I64, 0), args[0]]))
-        return builder.zext(row, ir.VectorType(_I32, LANES))
+        base = cgutils.global_constant(builder, "set_lanes", ir.Constant(table, rows))
+        row = builder.load(builder.gep(base, [ir.Constant(I64, 0), args[0]]))
+        return builder.zext(row, ir.VectorType(I32, LANES))
 
-    return _WHOLE(types.int64), generate
+    return INTS(types.int64), generate
 
 
 @intrinsic
@@ -380,11 +265,11 @@ def any_lane(typingctx: Any, mask: Any) -> Any:
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.icmp_unsigned("!=", builder.bitcast(args[0], _WORD), ir.Constant(_WORD, 0))
 
-    return types.boolean(_MASK), generate
+    return types.boolean(MASK), generate
 
 
 @intrinsic
-def total(typingctx: Any, a: Any) -> Any:
+def sum_lanes(typingctx: Any, a: Any) -> Any:
     """Sum over the lanes, pairwise, so that its order is fixed."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -392,31 +277,29 @@ def total(typingctx: Any, a: Any) -> Any:
         while count > 1:
             count //= 2
             undefined = ir.Constant(value.type, ir.Undefined)
-            halves = [
-                ir.Constant(ir.VectorType(_I32, count), list(range(start, start + count))) for start in (0, count)
-            ]
+            halves = [ir.Constant(ir.VectorType(I32, count), list(range(start, start + count))) for start in (0, count)]
             parts = [builder.shuffle_vector(value, undefined, half) for half in halves]
             value = builder.fadd(*parts)
-        return builder.extract_element(value, ir.Constant(_I32, 0))
+        return builder.extract_element(value, ir.Constant(I32, 0))
 
     return a.scalar(a), generate
 
 
 @intrinsic
-def largest(typingctx: Any, a: Any) -> Any:
+def largest_lane(typingctx: Any, a: Any) -> Any:
     """Greatest of int32 lanes."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _call(builder, f"llvm.vector.reduce.smax.{_suffix(args[0].type)}", _I32, [args[0]])
+        return call_intrinsic(builder, f"llvm.vector.reduce.smax.{suffix(args[0].type)}", I32, [args[0]])
 
-    return types.int32(_WHOLE), generate
+    return types.int32(INTS), generate
 
 
 @intrinsic
-def truths(typingctx: Any, mask: Any) -> Any:
+def mask_to_int(typingctx: Any, mask: Any) -> Any:
     """A mask as the int32 numbers 1 and 0."""
-    kind = ir.VectorType(_I32, LANES)
-    return _WHOLE(_MASK), lambda context, builder, sig, args: builder.zext(args[0], kind)
+    kind = ir.VectorType(I32, LANES)
+    return INTS(MASK), lambda context, builder, sig, args: builder.zext(args[0], kind)
 
 
 @intrinsic

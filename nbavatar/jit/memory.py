@@ -12,7 +12,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-__all__ = ["ahead", "fetch_add", "get", "pointer", "prefetch", "put"]
+__all__ = ["advance", "fetch_add", "get", "pointer", "pointers", "prefetch", "put"]
 
 
 @intrinsic
@@ -24,6 +24,23 @@ def pointer(typingctx: Any, array: Any, offset: Any) -> Any:
         return builder.gep(view.data, [args[1]])
 
     return types.CPointer(array.dtype)(array, types.intp), generate
+
+
+@intrinsic
+def pointers(typingctx: Any, group: Any) -> Any:
+    """A named tuple with the address of each array in place of it; other members stay. The caller keeps the arrays."""
+
+    def plain(kind: Any) -> Any:
+        return types.CPointer(kind.dtype) if isinstance(kind, types.Array) else kind
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        members = []
+        for kind, member in zip(group.types, cgutils.unpack_tuple(builder, args[0]), strict=True):
+            view = context.make_array(kind)(context, builder, member).data if isinstance(kind, types.Array) else member
+            members.append(view)
+        return context.make_tuple(builder, signature.return_type, members)
+
+    return types.BaseTuple.from_types([plain(kind) for kind in group.types], group.instance_class)(group), generate
 
 
 @intrinsic
@@ -48,7 +65,7 @@ def put(typingctx: Any, base: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
-def ahead(typingctx: Any, base: Any, count: Any) -> Any:
+def advance(typingctx: Any, base: Any, count: Any) -> Any:
     """The pointer `count` elements on.
 
     Where several addresses share a part, making it a pointer of its own keeps LLVM from working out the

@@ -5,11 +5,12 @@ at the near plane where the patch crosses it (`projection.py`), then, tile by ti
 edges of the patch themselves, so a thin diagonal billboard enters only the tiles it runs through.
 """
 
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
+from numba import types
 from numpy.typing import NDArray
 
 from nbavatar.errors import DeviceError
@@ -18,8 +19,11 @@ from nbavatar.jit.lanes import LANES
 from nbavatar.jit.memory import fetch_add
 from nbavatar.jit.workers import run_workers
 from nbavatar.rendering.patches import ProjectedPatches
+from nbavatar.rendering.scratch import array_of
 
-__all__ = ["RECORD", "TILE_HEIGHT", "TILE_WIDTH", "Bins", "bin_billboards", "require_memory", "tile_bounds"]
+__all__ = [
+    "RECORD", "TILE_HEIGHT", "TILE_WIDTH", "Bins", "bin_billboards", "bins_type", "require_memory", "tile_bounds",
+]  # fmt: skip
 
 TILE_WIDTH = 32  # pixels
 TILE_HEIGHT = 32
@@ -28,33 +32,39 @@ _CHUNK = 256  # billboards that a worker bins at a time
 _SLACK = 1e-3  # pixels by which bounds are widened, far more than rounding can move a corner
 
 
-@dataclass(frozen=True)
-class Bins:
-    """Billboards prepared for the kernels, and their entries in the tiles' lists.
+class Bins(NamedTuple):
+    """Billboards prepared for the kernels, and their entries in the tiles' lists, the bins.
 
     Attributes:
         record: (F, RECORD) see `pack`.
         box: (F, 4) int32, pixels `x0, y0, x1, y1` that a billboard may touch, the last two excluded.
-        sequence: (F,) int32, billboards in the order in which tiles take them.
-        place: (F,) int32, rank of each billboard, which settles equal depths.
-        first: (F + 1,) int64, entries of `sequence[i]` are `first[i] ... first[i + 1]`.
-        tile: (E,) int32, tile of each entry, in that numbering.
-        where: (E,) int64, its position in the tile-major lists.
-        start: (tiles + 1,) int64, list of each tile.
+        order: (F,) int32, billboards in the order in which tiles take them.
+        rank: (F,) int32, of each billboard, which settles equal depths.
+        entry_start: (F + 1,) int64, entries of `order[k]` are `entry_start[k] ... entry_start[k + 1]`.
+        entry_tile: (E,) int32, tile of each entry, in that numbering.
+        position: (E,) int64, its position in the tile-major lists.
+        tile_start: (tiles + 1,) int64, list of each tile.
         members: (E,) int32, the tile-major lists: billboards.
-        room: (tiles,) int64, most groups of `LANES` neighbouring pixels that the billboards of a tile can fill.
+        packets: (tiles,) int64, most packets of `LANES` neighbouring pixels that the billboards of a tile can fill.
     """
 
     record: NDArray
     box: NDArray[np.int32]
-    sequence: NDArray[np.int32]
-    place: NDArray[np.int32]
-    first: NDArray[np.int64]
-    tile: NDArray[np.int32]
-    where: NDArray[np.int64]
-    start: NDArray[np.int64]
+    order: NDArray[np.int32]
+    rank: NDArray[np.int32]
+    entry_start: NDArray[np.int64]
+    entry_tile: NDArray[np.int32]
+    position: NDArray[np.int64]
+    tile_start: NDArray[np.int64]
     members: NDArray[np.int32]
-    room: NDArray[np.int64]
+    packets: NDArray[np.int64]
+
+
+def bins_type(real: Any) -> Any:
+    """Numba's type of `Bins` whose records are of its type `real`."""
+    i32, i64 = array_of(types.int32), array_of(types.int64)
+    kinds = (array_of(real, 2), array_of(types.int32, 2), i32, i32, i64, i32, i64, i64, i32, i64)
+    return types.BaseTuple.from_types(kinds, Bins)
 
 
 @kernel
@@ -63,8 +73,8 @@ def pack(plane, fade, nearest, bounds, texels, width, height, reference, record,
 
     A record holds, relative to the centre of pixel ((x0 + x1) // 2, (y0 + y1) // 2) of the box, the
     affine functions of the texel coordinates s (0-2) and t (3-5) times inverse depth and of inverse
-    depth (6-8); inverse depth less `reference` at the origin (9); the fade (10); the largest inverse
-    depth less `reference` that any hit can have (11). The shift of the origin is made in float64:
+    depth (6-8); the key, inverse depth less `reference`, at the origin (9); the fade (10); the key that no
+    hit exceeds (11). The shift of the origin is made in float64:
     what is left has small numbers, which float32 holds well.
     """
     scale = 0.5 * (texels - 1) if texels > 1 else 1.0
@@ -90,13 +100,13 @@ def pack(plane, fade, nearest, bounds, texels, width, height, reference, record,
             record[i, 3 + j] = scale * plane[i, 1, j] + shift * w
             record[i, 6 + j] = w
         for row in range(3):
-            k = plane[i, row, 0] * x + plane[i, row, 1] * y + plane[i, row, 2]
+            value = plane[i, row, 0] * x + plane[i, row, 1] * y + plane[i, row, 2]
             w = plane[i, 2, 0] * x + plane[i, 2, 1] * y + plane[i, 2, 2]
             if row == 2:
                 record[i, 8] = w
                 record[i, 9] = w - reference
             else:
-                record[i, 3 * row + 2] = scale * k + shift * w
+                record[i, 3 * row + 2] = scale * value + shift * w
         record[i, 10] = fade[i]
         record[i, 11] = (1.0 + 1e-5) / nearest[i] - reference
 
@@ -125,60 +135,61 @@ def tile_bounds(tile, across, width, height):
 
 
 @kernel
-def list_tiles(turn, chunk, plane, box, sequence, support, tiles_across, first, tile, groups):
-    """Lists the tiles that the billboards touch, or, where `tile` is empty, counts them.
+def list_tiles(counter, chunk, plane, box, order, support, across, entry_start, entry_tile, entry_packets):
+    """Lists the tiles that the billboards touch, or, where `entry_tile` is empty, counts them.
 
     Args:
-        turn: (1,) int64, next place in `sequence`, shared by all workers; `chunk` are taken at a time.
-        first, tile: see Bins. While counting, first[k + 1] becomes the number of tiles of sequence[k].
-        groups: (E,) int32, groups of `LANES` neighbouring pixels that the billboard can fill in the tile.
+        counter: (1,) int64, next place in `order`, shared by all workers; `chunk` are taken at a time.
+        across: tiles side by side.
+        entry_start, entry_tile: see Bins. While counting, entry_start[k + 1] becomes the number of tiles of order[k].
+        entry_packets: (E,) int32, packets of `LANES` neighbouring pixels that the billboard can fill in the tile.
     """
-    counting = len(tile) == 0
+    counting = len(entry_tile) == 0
     while True:
-        begin = fetch_add(turn, chunk)
-        if begin >= len(sequence):
+        begin = fetch_add(counter, chunk)
+        if begin >= len(order):
             break
-        for k in range(begin, min(begin + chunk, len(sequence))):
-            i = sequence[k]
+        for k in range(begin, min(begin + chunk, len(order))):
+            i = order[k]
             if counting:
-                first[k + 1] = 0
-            elif first[k] == first[k + 1]:
+                entry_start[k + 1] = 0
+            elif entry_start[k] == entry_start[k + 1]:
                 continue
             if box[i, 2] <= box[i, 0]:
                 continue
-            entry = 0 if counting else first[k]
+            entry = 0 if counting else entry_start[k]
             for row in range(box[i, 1] // TILE_HEIGHT, (box[i, 3] - 1) // TILE_HEIGHT + 1):
                 y0, y1 = max(row * TILE_HEIGHT, box[i, 1]), min((row + 1) * TILE_HEIGHT, box[i, 3])
                 for column in range(box[i, 0] // TILE_WIDTH, (box[i, 2] - 1) // TILE_WIDTH + 1):
                     x0, x1 = max(column * TILE_WIDTH, box[i, 0]), min((column + 1) * TILE_WIDTH, box[i, 2])
                     if _touches(plane, i, support, x0, y0, x1, y1):
                         if not counting:
-                            tile[entry] = row * tiles_across + column
-                            groups[entry] = (x1 - x0 + LANES - 1) // LANES * (y1 - y0)
+                            entry_tile[entry] = row * across + column
+                            entry_packets[entry] = (x1 - x0 + LANES - 1) // LANES * (y1 - y0)
                         entry += 1
             if counting:
-                first[k + 1] = entry
+                entry_start[k + 1] = entry
 
 
 @kernel
-def sort_entries(sequence, first, tile, groups, where, start, members, room):
-    """Fills the tile-major lists from `tile` and `groups`; see `Bins` and `list_tiles`."""
-    start[:] = 0
-    room[:] = 0
-    for entry in range(len(tile)):
-        start[tile[entry] + 1] += 1
-    for t in range(len(start) - 1):
-        start[t + 1] += start[t]
-    for k in range(len(sequence)):
-        for entry in range(first[k], first[k + 1]):
-            t = tile[entry]
-            where[entry] = start[t]
-            members[start[t]] = sequence[k]
-            start[t] += 1
-            room[t] += groups[entry]
-    for t in range(len(start) - 1, 0, -1):
-        start[t] = start[t - 1]
-    start[0] = 0
+def sort_entries(order, entry_start, entry_tile, entry_packets, position, tile_start, members, packets):
+    """Fills the tile-major lists from `entry_tile` and `entry_packets`; see `Bins` and `list_tiles`."""
+    tile_start[:] = 0
+    packets[:] = 0
+    for entry in range(len(entry_tile)):
+        tile_start[entry_tile[entry] + 1] += 1
+    for t in range(len(tile_start) - 1):
+        tile_start[t + 1] += tile_start[t]
+    for k in range(len(order)):
+        for entry in range(entry_start[k], entry_start[k + 1]):
+            t = entry_tile[entry]
+            position[entry] = tile_start[t]
+            members[tile_start[t]] = order[k]
+            tile_start[t] += 1
+            packets[t] += entry_packets[entry]
+    for t in range(len(tile_start) - 1, 0, -1):
+        tile_start[t] = tile_start[t - 1]
+    tile_start[0] = 0
 
 
 def bin_billboards(
@@ -211,33 +222,33 @@ def bin_billboards(
     record = torch.empty(count, RECORD, dtype=dtype).numpy()
     box = torch.empty(count, 4, dtype=torch.int32).numpy()
     seen = bounds[:, 0] <= bounds[:, 2]
-    order = rank.numpy()
-    depths = projection.depth.numpy()[order]
-    depths = depths[seen[order] & (depths > 0)]
+    ranked = rank.numpy()
+    depths = projection.depth.numpy()[ranked]
+    depths = depths[seen[ranked] & (depths > 0)]
     reference = 1.0 / float(depths[len(depths) // 2]) if len(depths) else 1.0
     pack(plane, fade, nearest, bounds, texels, width, height, reference, record, box)
-    place = torch.empty(count, dtype=torch.int32).numpy()
-    place[order] = np.arange(count, dtype=np.int32)
-    sequence = order[np.argsort(nearest[order], kind="stable")] if by_nearest else order
-    sequence = sequence.astype(np.int32)
+    ranks = torch.empty(count, dtype=torch.int32).numpy()
+    ranks[ranked] = np.arange(count, dtype=np.int32)
+    order = ranked[np.argsort(nearest[ranked], kind="stable")] if by_nearest else ranked
+    order = order.astype(np.int32)
     across, down = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
-    first = np.zeros(count + 1, np.int64)
+    start = np.zeros(count + 1, np.int64)
 
-    def list_all(tile: NDArray[np.int32], groups: NDArray[np.int32]) -> None:
-        turn = np.zeros(1, np.int64)
-        run_workers(lambda _: list_tiles(turn, _CHUNK, plane, box, sequence, support, across, first, tile, groups))
+    def list_all(tile: NDArray[np.int32], packets: NDArray[np.int32]) -> None:
+        counter = np.zeros(1, np.int64)
+        run_workers(lambda _: list_tiles(counter, _CHUNK, plane, box, order, support, across, start, tile, packets))
 
     list_all(np.zeros(0, np.int32), np.zeros(0, np.int32))
-    np.cumsum(first, out=first)
-    entries = int(first[-1])
+    np.cumsum(start, out=start)
+    entries = int(start[-1])
     require_memory(entries * 20 + across * down * 8, f"the tile lists of {count} billboards ({entries} entries)")
-    tile, groups, members = (np.zeros(entries, np.int32) for _ in range(3))
-    where = np.zeros(entries, np.int64)
-    start, room = np.zeros(across * down + 1, np.int64), np.zeros(across * down, np.int64)
+    tile, entry_packets, members = (np.zeros(entries, np.int32) for _ in range(3))
+    position = np.zeros(entries, np.int64)
+    tile_start, packets = np.zeros(across * down + 1, np.int64), np.zeros(across * down, np.int64)
     if entries:
-        list_all(tile, groups)
-    sort_entries(sequence, first, tile, groups, where, start, members, room)
-    return Bins(record, box, sequence, place, first, tile, where, start, members, room)
+        list_all(tile, entry_packets)
+    sort_entries(order, start, tile, entry_packets, position, tile_start, members, packets)
+    return Bins(record, box, order, ranks, start, tile, position, tile_start, members, packets)
 
 
 def available_memory() -> int:

@@ -50,10 +50,10 @@ def count_tiles(plane, fade, nearest, bounds, reference, texels, width, height, 
     r = i * RECORD
     w = plane[i, 2, 0] * x + plane[i, 2, 1] * y + plane[i, 2, 2]
     for row in range(2):
-        k = plane[i, row, 0] * x + plane[i, row, 1] * y + plane[i, row, 2]
+        value = plane[i, row, 0] * x + plane[i, row, 1] * y + plane[i, row, 2]
         for j in range(2):
             record[r + 3 * row + j] = scale * plane[i, row, j] + shift * plane[i, 2, j]
-        record[r + 3 * row + 2] = scale * k + shift * w
+        record[r + 3 * row + 2] = scale * value + shift * w
     record[r + 6], record[r + 7], record[r + 8] = plane[i, 2, 0], plane[i, 2, 1], w
     record[r + 9] = w - reference[0]
     record[r + 10] = fade[i]
@@ -69,19 +69,19 @@ def count_tiles(plane, fade, nearest, bounds, reference, texels, width, height, 
 
 
 @cuda.jit
-def fill_tiles(plane, box, sequence, ends, support, across, tiles, members, status):
-    """Lists the tiles that billboards touch, in the order of `sequence`; entries beyond the arrays raise the flag.
+def fill_tiles(plane, box, order, ends, support, across, tiles, members, status):
+    """Lists the tiles that billboards touch, in `order`; entries beyond the arrays raise the flag.
 
     Args:
-        sequence: (F,) int64, billboards in the order in which tiles take them.
-        ends: (F,) int64, running number of entries up to and with each of `sequence`.
+        order: (F,) int64, billboards in the order in which tiles take them.
+        ends: (F,) int64, running number of entries up to and with each of `order`.
         tiles, members: (E,) int32, results.
         status: (1,) int32, set to 1 if E is too small.
     """
     k = cuda.grid(1)
-    if k >= sequence.shape[0]:
+    if k >= order.shape[0]:
         return
-    i = sequence[k]
+    i = order[k]
     entry = ends[k - 1] if k > 0 else 0
     if ends[k] > tiles.shape[0]:
         status[0] = 1

@@ -5,6 +5,7 @@ threads.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,16 +16,32 @@ from nbavatar.jit.compile import prepare
 from nbavatar.jit.lanes import LANES
 from nbavatar.jit.workers import run_workers
 from nbavatar.rendering import binning, workspace
-from nbavatar.rendering.billboards import cpu_blend, cpu_gather, cpu_scratch
-from nbavatar.rendering.billboards.cpu_hits import write_limits
+from nbavatar.rendering.billboards import cpu_gather, cpu_tiles
+from nbavatar.rendering.billboards.cpu_gather import GATHER_BUFFERS, GatherScratch, Gradients, Part
+from nbavatar.rendering.billboards.cpu_intersection import constants_of, constants_type
+from nbavatar.rendering.billboards.cpu_scratch import (
+    BROKEN,
+    BUFFERS,
+    GIVEN_UP,
+    HITS,
+    LIST,
+    Adjoints,
+    Images,
+    Scratch,
+    Shape,
+    Sizes,
+    Tape,
+    Textures,
+)
 from nbavatar.rendering.billboards.reference import BlendSettings
-from nbavatar.rendering.binning import bin_billboards, require_memory
+from nbavatar.rendering.binning import bin_billboards, bins_type, require_memory
 from nbavatar.rendering.patches import ProjectedPatches
+from nbavatar.rendering.scratch import array_of, scratch_bytes, scratch_type, scratch_views
 
-__all__ = ["blend_cpu", "count_samples"]
+__all__ = ["blend_cpu", "count_samples", "prepare_kernels"]
 
 _QUEUE = 64  # hits that may wait at a pixel; where half of them have to stay, a tile is done again with room for all
-_NOTES = 6 << 20  # bundles of hits noted at once in the backward pass: 576 MiB in float32
+_TAPE = 6 << 20  # bundles of hits on the tape at once: 576 MiB in float32
 _SCRATCH = 1 << 26  # bytes that a worker may use; fewer rows are worked on at once beyond it
 
 
@@ -73,12 +90,10 @@ def count_samples(
 
 @dataclass(frozen=True)
 class _Pass:
-    """Tiles that are worked on with queues of the same capacity, `rows` rows at once."""
+    """Tiles that are worked on with scratch of the same sizes."""
 
     tiles: np.ndarray
-    capacity: int
-    rows: int
-    bundles: int
+    sizes: Sizes
 
 
 class _Scene:
@@ -91,42 +106,42 @@ class _Scene:
         self.dtype = alpha.dtype
         self.texels, self.channels, self.count = alpha.shape[-1], features.shape[-1], len(alpha)
         self.stride = -(-self.channels // LANES) * LANES
-        _prepare(self.dtype)
-        self.features, self.alpha = features.detach().view(-1).numpy(), alpha.detach().view(-1).numpy()
+        prepare_kernels(self.dtype)
+        self.textures = Textures(features.detach().view(-1).numpy(), alpha.detach().view(-1).numpy())
         self.bins = bin_billboards(
             projection, rank, self.texels, s.width, s.height, s.support, self.dtype, by_nearest=s.queue < 0
         )
-        real = np.float32 if self.dtype == torch.float32 else np.float64
-        self.limits = write_limits(self.texels, s.near, s.alpha_min, s.t_min, s.alpha_max, real)
-        self.across = -(-s.width // binning.TILE_WIDTH)
-        self.lengths = np.diff(self.bins.start)
-        self.made = np.zeros(len(self.lengths) + 1, np.int64)
+        self.real = np.dtype(np.float32 if self.dtype == torch.float32 else np.float64)
+        self.constants = constants_of(self.texels, s.near, s.alpha_min, s.t_min, s.alpha_max, self.real.type)
+        self.lengths = np.diff(self.bins.tile_start)
+        self.bundles = np.zeros(len(self.lengths) + 1, np.int64)  # of each tile, as the forward pass finds them
         self.passes: list[_Pass] = []
         self.samples = 0
+
+    def _empty(self, *shape: int) -> np.ndarray:
+        return workspace.empty(shape, self.real)
 
     def forward(self) -> tuple[Tensor, Tensor]:
         """Blends all tiles, those whose queues were too short a second time."""
         s = self.settings
         pixels = s.width * s.height
-        require_memory(pixels * (self.channels + 1) * self.limits.itemsize, f"an image of {s.width}x{s.height} pixels")
-        real = self.limits.dtype
-        image = torch.from_numpy(workspace.empty((self.channels, s.height, s.width), real))
-        opacity = torch.from_numpy(workspace.empty((s.height, s.width), real))
-        nothing = np.zeros(0, self.limits.dtype)
-        results = (image.view(-1).numpy(), opacity.view(-1).numpy())
-        whole = np.zeros(0, np.int32)
+        require_memory(pixels * (self.channels + 1) * self.real.itemsize, f"an image of {s.width}x{s.height} pixels")
+        image = torch.from_numpy(self._empty(self.channels, s.height, s.width))
+        opacity = torch.from_numpy(self._empty(s.height, s.width))
+        images = Images(image.view(-1).numpy(), opacity.view(-1).numpy(), self.bundles)
         tiles = np.arange(len(self.lengths), dtype=np.int32)
         longest = int(self.lengths.max(initial=1))
         capacity = min(longest, _QUEUE if s.queue < 0 else s.queue + 1)
         while len(tiles):
             plan = self._plan(tiles, capacity)
-            states = self._run(plan, False, *results, nothing, nothing, nothing, whole, whole, 0)
-            broken = max((int(state[1]) for state in states), default=0)
+            states = self._run(plan, images, None)
+            broken = max((int(state[BROKEN]) for state in states), default=0)
             if broken:
                 _complain(broken - 1)
-            self.samples += sum(int(state[2]) for state in states)
-            again = np.sort(np.concatenate([state[3 : 3 + state[0]] for state in states])).astype(np.int32)
-            self.passes.append(_Pass(np.setdiff1d(tiles, again), plan.capacity, plan.rows, plan.bundles))
+            self.samples += sum(int(state[HITS]) for state in states)
+            again = np.concatenate([state[LIST : LIST + state[GIVEN_UP]] for state in states])
+            again = np.sort(again).astype(np.int32)
+            self.passes.append(_Pass(np.setdiff1d(tiles, again), plan.sizes))
             tiles = again
             capacity = int(self.lengths[tiles].max(initial=1))
         return image, opacity
@@ -134,123 +149,118 @@ class _Scene:
     def backward(self, grad_image: Tensor, grad_opacity: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Gradients by features, alpha, plane and fade."""
         s = self.settings
-        size = self.limits.itemsize
+        size = self.real.itemsize
         texels = self.count * self.texels**2
         require_memory(
             texels * (self.channels + 1) * size + s.width * s.height * (self.stride + 1) * size,
             f"the gradients of {self.count} billboards",
         )
-        grad_alpha = torch.from_numpy(workspace.empty((self.count, self.texels, self.texels), self.limits.dtype))
-        shape = (*grad_alpha.shape, self.channels)
-        grad_features = torch.from_numpy(workspace.empty(shape, self.limits.dtype))
+        grad_alpha = torch.from_numpy(self._empty(self.count, self.texels, self.texels))
+        grad_features = torch.from_numpy(self._empty(*grad_alpha.shape, self.channels))
         grad_plane = torch.empty(self.count, 3, 3, dtype=torch.float64)
         grad_fade = torch.empty(self.count, dtype=torch.float64)
-        covers = grad_opacity.to(self.dtype).contiguous().view(-1).numpy()
-        outputs = (grad_features.view(-1).numpy(), grad_alpha.view(-1).numpy(), grad_plane.numpy(), grad_fade.numpy())
-        self._replay(self._rows(grad_image), covers, outputs)
+        adjoints = Adjoints(self._rows(grad_image), grad_opacity.to(self.dtype).contiguous().view(-1).numpy())
+        flat = grad_features.view(-1).numpy(), grad_alpha.view(-1).numpy()
+        self._replay(adjoints, Gradients(*flat, grad_plane.numpy(), grad_fade.numpy()))
         return grad_features, grad_alpha, grad_plane, grad_fade
 
     def _rows(self, image: Tensor) -> np.ndarray:
         """An image (C, H, W) as (H, W, stride), flat."""
         pixels = self.settings.width * self.settings.height
         planes = image.to(self.dtype).contiguous().view(-1).numpy()
-        rows = workspace.empty(((pixels + LANES) * self.stride,), self.limits.dtype)
-        turn = np.zeros(1, np.int64)
-        run_workers(lambda _: cpu_gather.interleave(turn, 1 << 14, planes, rows, self.channels, pixels))
+        rows = self._empty((pixels + LANES) * self.stride)
+        counter = np.zeros(1, np.int64)
+        run_workers(lambda _: cpu_gather.interleave(counter, 1 << 14, planes, rows, self.channels, pixels))
         return rows
 
-    def _replay(self, grads: np.ndarray, covers: np.ndarray, outputs: tuple[np.ndarray, ...]) -> None:
-        """Repeats the blending, range of tiles by range of tiles, and fills the gradients `outputs`."""
-        b = self.bins
-        first_bundle = np.concatenate([[0], np.cumsum(self.made[:-1])])
-        parts = _divide(first_bundle)
-        largest = max((int(first_bundle[end] - first_bundle[first]) for first, end in parts), default=0)
-        bands = max((-(-binning.TILE_HEIGHT // plan.rows) for plan in self.passes), default=1)
-        entries = len(b.members)
+    def _replay(self, adjoints: Adjoints, gradients: Gradients) -> None:
+        """Repeats the blending, range of tiles by range of tiles, and fills the gradients."""
+        tile_bundle = np.concatenate([[0], np.cumsum(self.bundles[:-1])])
+        parts = _divide(tile_bundle)
+        largest = max((int(tile_bundle[end] - tile_bundle[first]) for first, end in parts), default=0)
+        bands = max((-(-binning.TILE_HEIGHT // plan.sizes.rows) for plan in self.passes), default=1)
+        entries = len(self.bins.members)
         require_memory(
-            largest * LANES * (2 * self.limits.itemsize + 4) + bands * entries * 8,
-            f"the notes of {largest * LANES} hits in the backward pass",
+            largest * LANES * (2 * self.real.itemsize + 4) + bands * entries * 8,
+            f"the tape of {largest * LANES} hits in the backward pass",
         )
-        notes = workspace.empty((2 * LANES * largest,), self.limits.dtype)
-        spots = workspace.empty((LANES * largest,), np.dtype(np.int32))
-        nothing = np.zeros(0, self.limits.dtype)
-        shape = np.array([self.texels, self.channels, self.settings.width, self.across], np.int64)
+        values = self._empty(2 * LANES * largest)
+        pixels = workspace.empty((LANES * largest,), np.dtype(np.int32))
         for number, (first, end) in enumerate(parts):
             ranges = np.zeros(2 * bands * entries, np.int32)
-            base = int(first_bundle[first])
+            tape = Tape(values, pixels, ranges, tile_bundle, int(tile_bundle[first]))
             for plan in self.passes:
                 chosen = plan.tiles[(plan.tiles >= first) & (plan.tiles < end)]
-                part = _Pass(chosen, plan.capacity, plan.rows, plan.bundles)
-                states = self._run(
-                    part, True, nothing, nothing, grads, covers, notes, spots, ranges, base, first_bundle
-                )
-                if any(state[0] for state in states):
+                states = self._run(_Pass(chosen, plan.sizes), None, (adjoints, tape))
+                if any(state[GIVEN_UP] for state in states):
                     raise RuntimeError("render_billboards: the backward pass finds other hits than the forward pass")
-            turn = np.zeros(1, np.int64)
+            self._gather(Part(16, first, end, bands, number == 0), adjoints, tape, gradients)
 
-            def work(_: int, first=first, end=end, base=base, fresh=number == 0, turn=turn, ranges=ranges) -> None:
-                cpu_gather.gather_gradients(
-                    turn, 16, first, end, bands, b.sequence, b.first, b.tile, b.where, ranges, first_bundle, notes,
-                    spots, base, b.record.reshape(-1), b.box, self.features, self.alpha, self.limits, shape, grads,
-                    fresh, *outputs,
-                    torch.empty(cpu_gather.scratch_size(self.texels, self.channels), dtype=self.dtype).numpy(),
-                )  # fmt: skip
+    def _gather(self, part: Part, adjoints: Adjoints, tape: Tape, gradients: Gradients) -> None:
+        """Adds what is on the tape to the gradients."""
+        sizes = Sizes(1, 1, self.channels, 0, self.texels)
+        counter = np.zeros(1, np.int64)
 
-            run_workers(work)
+        def work(_: int) -> None:
+            memory = workspace.empty((scratch_bytes(GATHER_BUFFERS, sizes, self.real, True),), np.dtype(np.uint8))
+            cpu_gather.gather_gradients(
+                counter, part, self.bins, self.textures, self.constants, self._shape(sizes), adjoints, tape, gradients,
+                scratch_views(GatherScratch, GATHER_BUFFERS, sizes, self.real, True, memory),
+            )  # fmt: skip
+
+        run_workers(work)
 
     def _plan(self, tiles: np.ndarray, capacity: int) -> _Pass:
         """How many rows to work on at once."""
         longest = int(self.lengths[tiles].max(initial=0))
-        most = int(self.bins.room[tiles].max(initial=0))
+        most = int(self.bins.packets[tiles].max(initial=0))
         rows = binning.TILE_HEIGHT
         while True:
             bundles = min(most, longest * rows * (binning.TILE_WIDTH // LANES))
-            if rows == 1 or self._bytes(rows, capacity, bundles) <= _SCRATCH:
-                return _Pass(tiles, capacity, rows, bundles)
+            sizes = Sizes(rows, capacity, self.channels, bundles, self.texels)
+            if rows == 1 or scratch_bytes(BUFFERS, sizes, self.real, True) <= _SCRATCH:
+                return _Pass(tiles, sizes)
             rows //= 2
 
-    def _bytes(self, rows: int, capacity: int, bundles: int) -> int:
-        reals, wholes = cpu_scratch.scratch_sizes(rows, capacity, self.channels, bundles, True)
-        return reals * self.limits.itemsize + wholes * 4
-
-    def _run(
-        self, plan: _Pass, replay: bool, image: np.ndarray, opacity: np.ndarray, grads: np.ndarray, covers: np.ndarray,
-        notes: np.ndarray, spots: np.ndarray, ranges: np.ndarray, base: int, made: np.ndarray | None = None,
-    ) -> list[np.ndarray]:  # fmt: skip
-        """Runs the blending kernel on all threads; returns each one's status."""
-        s, b = self.settings, self.bins
-        workers = torch.get_num_threads()
-        require_memory(
-            workers * self._bytes(plan.rows, plan.capacity, plan.bundles), f"queues of {plan.capacity} hits a pixel"
+    def _shape(self, sizes: Sizes) -> Shape:
+        s = self.settings
+        across = -(-s.width // binning.TILE_WIDTH)
+        return Shape(
+            self.texels, self.channels, s.width, s.height, across, s.queue, sizes.capacity, sizes.rows, sizes.bundles
         )
-        reals, wholes = cpu_scratch.scratch_sizes(plan.rows, plan.capacity, self.channels, plan.bundles, replay)
-        values = [
-            self.texels, self.channels, s.width, s.height, self.across, s.queue, plan.capacity, plan.rows, plan.bundles,
-        ]  # fmt: skip
-        shape = np.array(values, np.int64)
-        turn = np.zeros(1, np.int64)
+
+    def _run(self, plan: _Pass, images: Images | None, backward: tuple[Adjoints, Tape] | None) -> list[np.ndarray]:
+        """Runs the forward kernel, or with `backward` that of the replay, on all threads; returns each one's status."""
+        workers, replay = torch.get_num_threads(), backward is not None
+        needed = scratch_bytes(BUFFERS, plan.sizes, self.real, replay)
+        require_memory(workers * needed, f"queues of {plan.sizes.capacity} hits a pixel")
+        reals, i32, i64 = (np.zeros(0, dtype) for dtype in (self.real, np.int32, np.int64))
+        images = images or Images(reals, reals, i64)
+        adjoints, tape = backward or (Adjoints(reals, reals), Tape(reals, i32, i32, i64, 0))
+        work_tiles = cpu_tiles.replay_tiles if replay else cpu_tiles.blend_tiles
+        counter = np.zeros(1, np.int64)
 
         def work(_: int) -> np.ndarray:
-            status = np.zeros(3 + len(plan.tiles), np.int64)
-            (cpu_blend.note_tiles if replay else cpu_blend.blend_tiles)(
-                turn, plan.tiles, b.start, b.members, b.record.reshape(-1), b.box, b.place, self.features,
-                self.alpha, self.limits, shape, image, opacity, grads, covers, notes, spots, ranges,
-                self.made if made is None else made, base, workspace.empty((reals,), self.limits.dtype),
-                workspace.empty((wholes,), np.dtype(np.int32)), status,
+            status = np.zeros(LIST + len(plan.tiles), np.int64)
+            memory = workspace.empty((needed,), np.dtype(np.uint8))
+            scratch = scratch_views(Scratch, BUFFERS, plan.sizes, self.real, replay, memory)
+            work_tiles(
+                counter, plan.tiles, self.bins, self.textures, self.constants, self._shape(plan.sizes), images,
+                adjoints, tape, scratch, status,
             )  # fmt: skip
             return status
 
         return run_workers(work)
 
 
-def _divide(first_bundle: np.ndarray) -> list[tuple[int, int]]:
-    """Consecutive tiles whose hits can be noted together."""
+def _divide(tile_bundle: np.ndarray) -> list[tuple[int, int]]:
+    """Consecutive tiles whose hits fit on the tape together."""
     parts, first = [], 0
-    for tile in range(1, len(first_bundle)):
-        if tile > first and first_bundle[tile] - first_bundle[first] > _NOTES and tile - first > 1:
+    for tile in range(1, len(tile_bundle)):
+        if tile > first and tile_bundle[tile] - tile_bundle[first] > _TAPE and tile - first > 1:
             parts.append((first, tile - 1))
             first = tile - 1
-    parts.append((first, len(first_bundle) - 1))
+    parts.append((first, len(tile_bundle) - 1))
     return parts
 
 
@@ -262,42 +272,39 @@ def _complain(billboard: int) -> None:
     )
 
 
-def _prepare(dtype: torch.dtype) -> None:
-    """Has every kernel compiled for a dtype."""
+def prepare_kernels(dtype: torch.dtype) -> None:
+    """Has every kernel compiled for a dtype, float32 or float64."""
     real = types.float32 if dtype == torch.float32 else types.float64
+    boolean, i32, i64, f64 = types.boolean, types.int32, types.int64, types.float64
+    reals, i32s, i64s = array_of(real), array_of(i32), array_of(i64)
 
-    def array(kind, dimensions: int = 1):
-        return types.Array(kind, dimensions, "C")
+    def group(kind: type, *members: Any) -> Any:
+        return types.BaseTuple.from_types(members, kind)
 
-    i32, i64, f64 = types.int32, types.int64, types.float64
+    bins, constants = bins_type(real), constants_type(real)
+    shape = group(Shape, *[i64] * len(Shape._fields))
+    textures, adjoints = group(Textures, reals, reals), group(Adjoints, reals, reals)
+    tape = group(Tape, reals, i32s, i32s, i64s, i64)
+    tiles = (
+        i64s, i32s, bins, textures, constants, shape, group(Images, reals, reals, i64s), adjoints, tape,
+        scratch_type(Scratch, BUFFERS, real), i64s,
+    )  # fmt: skip
     prepare(
         f"billboards-{real}",
         {
             binning.pack: (
-                array(f64, 3), array(f64), array(f64), array(f64, 2), i64, i64, i64, f64, array(real, 2), array(i32, 2),
+                array_of(f64, 3), array_of(f64), array_of(f64), array_of(f64, 2), i64, i64, i64, f64,
+                array_of(real, 2), array_of(i32, 2),
             ),
-            binning.list_tiles: (
-                array(i64), i64, array(f64, 3), array(i32, 2), array(i32), f64, i64, array(i64), array(i32), array(i32),
-            ),
-            binning.sort_entries: (
-                array(i32), array(i64), array(i32), array(i32), array(i64), array(i64), array(i32), array(i64),
-            ),
-            cpu_blend.blend_tiles: (
-                array(i64), array(i32), array(i64), array(i32), array(real), array(i32, 2), array(i32), array(real),
-                array(real), array(real), array(i64), *[array(real)] * 5, *[array(i32)] * 2, array(i64), i64,
-                array(real), array(i32), array(i64),
-            ),
-            cpu_blend.note_tiles: (
-                array(i64), array(i32), array(i64), array(i32), array(real), array(i32, 2), array(i32), array(real),
-                array(real), array(real), array(i64), *[array(real)] * 5, *[array(i32)] * 2, array(i64), i64,
-                array(real), array(i32), array(i64),
-            ),
-            cpu_gather.interleave: (array(i64), i64, array(real), array(real), i64, i64),
+            binning.list_tiles: (i64s, i64, array_of(f64, 3), array_of(i32, 2), i32s, f64, i64, i64s, i32s, i32s),
+            binning.sort_entries: (i32s, i64s, i32s, i32s, i64s, i64s, i32s, i64s),
+            cpu_tiles.blend_tiles: tiles,
+            cpu_tiles.replay_tiles: tiles,
+            cpu_gather.interleave: (i64s, i64, reals, reals, i64, i64),
             cpu_gather.gather_gradients: (
-                array(i64), i64, i64, i64, i64, array(i32), array(i64), array(i32), array(i64), array(i32), array(i64),
-                array(real), array(i32), i64, array(real), array(i32, 2), array(real), array(real), array(real),
-                array(i64), array(real), types.boolean, array(real), array(real), array(f64, 3), array(f64),
-                array(real),
+                i64s, group(Part, i64, i64, i64, i64, boolean), bins, textures, constants, shape, adjoints, tape,
+                group(Gradients, reals, reals, array_of(f64, 3), array_of(f64)),
+                scratch_type(GatherScratch, GATHER_BUFFERS, real),
             ),
         },
     )  # fmt: skip

@@ -1,87 +1,114 @@
-"""Numba kernel that gathers the noted hits into gradients, billboard by billboard.
+"""Numba kernel that gathers what is on the tape into gradients, billboard by billboard: the adjoint of sampling.
 
 Every gradient has one writer and a fixed order of summation: results do not depend on threads or timing.
 """
 
+from collections import namedtuple
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from nbavatar.jit.compile import inlined, kernel
+from nbavatar.jit.lane_memory import load, masked_load, masked_store, store
 from nbavatar.jit.lanes import (
     LANES,
     any_lane,
-    bits,
-    choose,
+    broadcast,
     count_trailing_zeros,
     first_lanes,
-    load,
-    load_where,
-    spread,
-    store,
-    store_where,
+    mask_bits,
+    select,
+    sum_lanes,
     to_real,
-    total,
     transpose,
-)  # fmt: skip
-from nbavatar.jit.memory import ahead, fetch_add, get, pointer, prefetch, put
-from nbavatar.rendering.billboards.cpu_hits import (
-    cells,
+)
+from nbavatar.jit.memory import advance, fetch_add, get, pointer, pointers, prefetch, put
+from nbavatar.rendering.billboards.cpu_intersection import (
+    broadcast_constants,
     corners,
+    first_texels,
     footprint,
     intersect,
     mix,
     patch_of,
     plane_slopes,
-    read_limits,
     slopes,
-    spread_limits,
-)  # fmt: skip
-from nbavatar.rendering.billboards.cpu_scratch import COLUMN, ROW
+)
+from nbavatar.rendering.billboards.cpu_scratch import COLUMN, ROW, Layout
 from nbavatar.rendering.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
+from nbavatar.rendering.scratch import Buffer
 
-__all__ = ["gather_gradients", "interleave", "scratch_size"]
+__all__ = ["GATHER_BUFFERS", "GatherScratch", "Gradients", "Part", "gather_gradients", "interleave"]
 
 _AHEAD = 8192  # numbers of the next billboard's textures that are asked for in advance
-_NOTES = 8  # bundles of the next tile's notes likewise
+_AHEAD_TAPE = 8  # bundles of the next tile's tape likewise
+
+GATHER_BUFFERS = (
+    # of a bundle: one vector for each of the four texels about its hits
+    # the texel's bilinear weight times that of the hit, and then times the adjoint of the hit's alpha sample
+    Buffer("corner_weight", None, lambda n: 8 * LANES),
+    Buffer("product", None, lambda n: 4 * LANES),  # adjoint of the pixel's colour times the texel's features
+    Buffer("texel", None, lambda n: LANES),  # numbers of the first texels, as floating-point numbers
+    # of the current billboard
+    Buffer("dL_dalpha", None, lambda n: n.texels**2),
+    Buffer("dL_dfeature", None, lambda n: n.texels**2 * -(-n.channels // LANES) * LANES),  # `stride` a texel
+)
+GatherScratch = namedtuple("GatherScratch", [buffer.name for buffer in GATHER_BUFFERS])
 
 
-def scratch_size(texels: int, channels: int) -> int:
-    """Numbers that a worker needs."""
-    return texels * texels * (LANES + -(-channels // LANES) * LANES) + 16 * LANES
+class Part(NamedTuple):
+    """What one call of `gather_gradients` is about."""
+
+    chunk: Any  # billboards that a worker takes at a time
+    first_tile: Any
+    end_tile: Any
+    bands: Any  # in which each tile was worked on
+    fresh: Any  # whether the gradients are still uninitialised memory
+
+
+class Gradients(NamedTuple):
+    """Results: like the textures, flat; (F, 3, 3) and (F,) float64."""
+
+    features: Any
+    alpha: Any
+    plane: Any
+    fade: Any
 
 
 @inlined
-def _plane(planes, channel, channels, pixels, pixel, here):
+def _plane(planes, channel, channels, pixels, pixel, mask):
     """Pixels of a channel; 0 where there is none."""
-    none = first_lanes(0)
-    return load_where(planes, min(channel, channels - 1) * pixels + pixel, here if channel < channels else none)
+    return masked_load(
+        planes, min(channel, channels - 1) * pixels + pixel, mask if channel < channels else first_lanes(0)
+    )
 
 
 @kernel
-def interleave(turn, chunk, planes_, rows_, channels, pixels):
+def interleave(counter, chunk, planes_, rows_, channels, pixels):
     """Turns images of one channel each into rows of one pixel each, filled up with zeros to whole vectors.
 
     Args:
-        turn: (1,) int64, next of the pixels, shared by all workers; `chunk`, whole vectors, are taken at a time.
+        counter: (1,) int64, next of the pixels, shared by all workers; `chunk`, whole vectors, are taken at a time.
         planes: (channels, pixels) flat; rows: (pixels, stride) flat, the result.
     """
     planes, rows = pointer(planes_, 0), pointer(rows_, 0)
     stride = (channels + LANES - 1) // LANES * LANES
     while True:
-        begin = fetch_add(turn, chunk)
+        begin = fetch_add(counter, chunk)
         if begin >= pixels:
             break
         for pixel in range(begin, min(begin + chunk, pixels), LANES):
-            here = first_lanes(pixels - pixel)
+            mask = first_lanes(pixels - pixel)
             for c in range(0, channels, LANES):
                 columns = transpose((
-                    _plane(planes, c, channels, pixels, pixel, here),
-                    _plane(planes, c + 1, channels, pixels, pixel, here),
-                    _plane(planes, c + 2, channels, pixels, pixel, here),
-                    _plane(planes, c + 3, channels, pixels, pixel, here),
-                    _plane(planes, c + 4, channels, pixels, pixel, here),
-                    _plane(planes, c + 5, channels, pixels, pixel, here),
-                    _plane(planes, c + 6, channels, pixels, pixel, here),
-                    _plane(planes, c + 7, channels, pixels, pixel, here),
+                    _plane(planes, c, channels, pixels, pixel, mask),
+                    _plane(planes, c + 1, channels, pixels, pixel, mask),
+                    _plane(planes, c + 2, channels, pixels, pixel, mask),
+                    _plane(planes, c + 3, channels, pixels, pixel, mask),
+                    _plane(planes, c + 4, channels, pixels, pixel, mask),
+                    _plane(planes, c + 5, channels, pixels, pixel, mask),
+                    _plane(planes, c + 6, channels, pixels, pixel, mask),
+                    _plane(planes, c + 7, channels, pixels, pixel, mask),
                 ))  # fmt: skip
                 for lane in range(min(LANES, pixels - pixel)):
                     store(rows, (pixel + lane) * stride + c, columns[lane])
@@ -93,181 +120,184 @@ def _add(totals, at, value):
 
 
 @inlined
-def _texels(word, k, grads, width, spots, features, totals, alphas, channels, stride, right, below, zero):
-    """Adds the hits with a bit in `word` to the texels' gradients, one after the other.
+def _add_hits(word, scratch, adjoints, width, pixels, features, layout, zero):
+    """Adds the hits of a bundle with a bit in `word` to the texels' gradients, one after the other.
 
     Args:
-        grads: gradients of the image's rows from the tile's first pixel on; spots: the hits' places in the tile.
-        k: rows of LANES numbers: weights of features (0-3) and of alpha (4-7) at the four texels; results: the
-            gradients' products with the four texels' features (8-11); `cell` (12): first texels, as numbers.
-        totals, alphas: gradients of this billboard's features, `stride` a texel, and alpha.
+        adjoints: of the image's rows from the tile's first pixel on; width: of the image; pixels: the hits' places in
+            the tile.
+        scratch: `corner_weight`, `texel` given, `product` and the gradients are results.
+        features: pointer to the billboard's.
     """
+    channels, stride, right, below = layout.channels, layout.stride, layout.step, layout.step * layout.texels
+    alpha, product = scratch.dL_dalpha, scratch.product
     while word != 0:
         lane = count_trailing_zeros(word)
         word &= word - 1
-        cell = np.int64(get(k, 12 * LANES + lane))
+        texel = np.int64(get(scratch.texel, lane))
         # one after the other: of a single-texel texture all four are the same place
-        put(alphas, cell, get(alphas, cell) + get(k, 4 * LANES + lane))
-        put(alphas, cell + right, get(alphas, cell + right) + get(k, 5 * LANES + lane))
-        put(alphas, cell + below, get(alphas, cell + below) + get(k, 6 * LANES + lane))
-        put(alphas, cell + below + right, get(alphas, cell + below + right) + get(k, 7 * LANES + lane))
-        w00, w01 = spread(get(k, lane)), spread(get(k, LANES + lane))
-        w10, w11 = spread(get(k, 2 * LANES + lane)), spread(get(k, 3 * LANES + lane))
-        d00, d01, d10, d11 = spread(zero), spread(zero), spread(zero), spread(zero)
-        texel, sums = ahead(features, cell * channels), ahead(totals, cell * stride)
-        spot = np.int64(get(spots, lane))
-        grads_here = ahead(grads, ((spot >> ROW) * width + (spot & COLUMN)) * stride)
+        weight = advance(scratch.corner_weight, 4 * LANES + lane)
+        put(alpha, texel, get(alpha, texel) + get(weight, 0))
+        put(alpha, texel + right, get(alpha, texel + right) + get(weight, LANES))
+        put(alpha, texel + below, get(alpha, texel + below) + get(weight, 2 * LANES))
+        put(alpha, texel + below + right, get(alpha, texel + below + right) + get(weight, 3 * LANES))
+        weight = advance(scratch.corner_weight, lane)
+        w00, w01 = broadcast(get(weight, 0)), broadcast(get(weight, LANES))
+        w10, w11 = broadcast(get(weight, 2 * LANES)), broadcast(get(weight, 3 * LANES))
+        d00, d01, d10, d11 = broadcast(zero), broadcast(zero), broadcast(zero), broadcast(zero)
+        source, totals = advance(features, texel * channels), advance(scratch.dL_dfeature, texel * stride)
+        pixel = np.int64(get(pixels, lane))
+        row = advance(adjoints, ((pixel >> ROW) * width + (pixel & COLUMN)) * stride)
         for c in range(0, channels, LANES):
             used = first_lanes(channels - c)
-            grad = load(grads_here, c)
-            d00 = d00 + grad * load_where(texel, c, used)
-            d01 = d01 + grad * load_where(texel, right * channels + c, used)
-            d10 = d10 + grad * load_where(texel, below * channels + c, used)
-            d11 = d11 + grad * load_where(texel, (below + right) * channels + c, used)
-            _add(sums, c, grad * w00)
-            _add(sums, right * stride + c, grad * w01)
-            _add(sums, below * stride + c, grad * w10)
-            _add(sums, (below + right) * stride + c, grad * w11)
-        put(k, 8 * LANES + lane, total(d00))
-        put(k, 9 * LANES + lane, total(d01))
-        put(k, 10 * LANES + lane, total(d10))
-        put(k, 11 * LANES + lane, total(d11))
+            dL_dcolour = load(row, c)
+            d00 = d00 + dL_dcolour * masked_load(source, c, used)
+            d01 = d01 + dL_dcolour * masked_load(source, right * channels + c, used)
+            d10 = d10 + dL_dcolour * masked_load(source, below * channels + c, used)
+            d11 = d11 + dL_dcolour * masked_load(source, (below + right) * channels + c, used)
+            _add(totals, c, dL_dcolour * w00)
+            _add(totals, right * stride + c, dL_dcolour * w01)
+            _add(totals, below * stride + c, dL_dcolour * w10)
+            _add(totals, (below + right) * stride + c, dL_dcolour * w11)
+        put(product, lane, sum_lanes(d00))
+        put(product, LANES + lane, sum_lanes(d01))
+        put(product, 2 * LANES + lane, sum_lanes(d10))
+        put(product, 3 * LANES + lane, sum_lanes(d11))
 
 
 @inlined
-def _hand_over(totals, alphas, grad_features, grad_alpha, area, channels, stride, fresh):
+def _hand_over(scratch, features, alpha, layout, fresh):
     """Copies a billboard's sums to the results, or adds them."""
-    for texel in range(area):
+    channels, stride = layout.channels, layout.stride
+    for texel in range(layout.texels * layout.texels):
         for c in range(0, channels, LANES):
             used = first_lanes(channels - c)
-            value = load(totals, texel * stride + c)
+            value = load(scratch.dL_dfeature, texel * stride + c)
             if not fresh:
-                value = value + load_where(grad_features, texel * channels + c, used)
-            store_where(grad_features, texel * channels + c, value, used)
-        put(grad_alpha, texel, get(alphas, texel) if fresh else get(grad_alpha, texel) + get(alphas, texel))
+                value = value + masked_load(features, texel * channels + c, used)
+            masked_store(features, texel * channels + c, value, used)
+        value = get(scratch.dL_dalpha, texel)
+        put(alpha, texel, value if fresh else get(alpha, texel) + value)
 
 
 @kernel
-def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, tile, where, ranges_, made, notes_,
-                     spots_, base, record_, box, features_, alpha_, limits_, shape, grads_, fresh, grad_features_,
-                     grad_alpha_, grad_plane, grad_fade, real):  # fmt: skip
-    """Gathers the noted hits of tiles `first_tile ... end_tile`.
+def gather_gradients(counter, part, bins, textures_, constants, shape, adjoints_, tape_, gradients_, scratch_):
+    """Gathers the hits on the tape of tiles `first_tile ... end_tile`.
 
     Args:
-        turn: (1,) int64, next of the billboards, shared by all workers; `chunk` are taken at a time.
-        bands: in which each tile was worked on.
-        sequence, first, tile, where, record, box: see Bins; `record` flat.
-        ranges, made, notes, spots, base, features, alpha, limits, grads: see `blend_tiles`.
-        shape: texels, channels, width, tiles across.
-        fresh: whether the gradients are still uninitialised memory.
-        grad_features, grad_alpha: like the textures, flat.
-        grad_plane: (F, 3, 3) float64; `grad_fade`: (F,) float64.
-        real: scratch of this worker; see `scratch_size`.
+        counter: (1,) int64, next of the billboards, shared by all workers.
+        part, gradients: see above; scratch: `GatherScratch`.
+        bins: see Bins.
+        textures, shape, adjoints, tape: see `cpu_scratch`; constants: see `cpu_intersection`.
     """
-    texels, channels, width, across = shape[0], shape[1], shape[2], shape[3]
-    limits, record, features, alpha = (
-        pointer(limits_, 0), pointer(record_, 0), pointer(features_, 0), pointer(alpha_, 0),
+    texels, width, across = shape.texels, shape.width, shape.across
+    order, box, entry_start, entry_tile, position = (
+        bins.order, bins.box, bins.entry_start, bins.entry_tile, bins.position,
     )  # fmt: skip
-    ranges, notes, spots, grads = pointer(ranges_, 0), pointer(notes_, 0), pointer(spots_, 0), pointer(grads_, 0)
-    numbers = read_limits(limits)
-    common = spread_limits(numbers)
-    zero, step, none = numbers.zero, min(1, texels - 1), common.zero
-    area, stride = texels * texels, (channels + LANES - 1) // LANES * LANES
-    k, alphas = pointer(real, 0), pointer(real, 16 * LANES)
-    totals = pointer(real, 16 * LANES + area * LANES)
+    record, textures, tape, scratch = pointers(bins).record, pointers(textures_), pointers(tape_), pointers(scratch_)
+    adjoints, gradients = pointers(adjoints_).features, pointers(gradients_)
+    grad_plane, grad_fade = gradients_.plane, gradients_.fade
+    tile_bundle = tape_.tile_bundle
+    lanes = broadcast_constants(constants)
+    zero, zeros = constants.zero, lanes.zero
+    layout = Layout(texels, min(1, texels - 1), shape.channels, (shape.channels + LANES - 1) // LANES * LANES)
+    area, step, size = texels * texels, layout.step, textures_.alpha.itemsize
     scale = 0.5 * (texels - 1) if texels > 1 else 1.0
-    middle = spread(zero + np.float32(0.5 * (texels - 1)))  # of a texture: where its plane's coordinates are 0
-    for j in range(16 * LANES):
-        put(k, j, zero)
+    middle = broadcast(zero + np.float32(0.5 * (texels - 1)))  # of a texture: where its plane's coordinates are 0
+    for j in range(4 * LANES):  # lanes without a hit are read as well
+        put(scratch.product, j, zero)
     while True:
-        begin = fetch_add(turn, chunk)
-        if begin >= len(sequence):
+        begin = fetch_add(counter, part.chunk)
+        if begin >= len(order):
             break
-        for order in range(begin, min(begin + chunk, len(sequence))):
-            i = np.int64(sequence[order])
+        for place in range(begin, min(begin + part.chunk, len(order))):
+            i = np.int64(order[place])
             used = False
             x_origin, y_origin = (box[i, 0] + box[i, 2]) // 2, (box[i, 1] + box[i, 3]) // 2
-            patch = patch_of(ahead(record, i * RECORD))
-            s_x, s_y, s_1, t_x, t_y, t_1, w_x, w_y, w_1, g_fade = (
-                none, none, none, none, none, none, none, none, none, none,
+            patch = patch_of(advance(record, i * RECORD))
+            s_x, s_y, s_1, t_x, t_y, t_1, w_x, w_y, w_1, dL_dfade = (
+                zeros, zeros, zeros, zeros, zeros, zeros, zeros, zeros, zeros, zeros,
             )  # fmt: skip
-            if order + 1 < len(sequence) and first[order + 1] < first[order + 2]:
+            if place + 1 < len(order) and entry_start[place + 1] < entry_start[place + 2]:
                 # the next billboard's texture comes while this one is worked on
-                following = np.int64(sequence[order + 1]) * area
-                for j in range(0, min(area * channels, _AHEAD), 64 // alpha_.itemsize):
-                    prefetch(features, following * channels + j)
-                for j in range(0, min(area, _AHEAD), 64 // alpha_.itemsize):
-                    prefetch(alpha, following + j)
-            for entry in range(first[order], first[order + 1]):
-                if tile[entry] < first_tile or tile[entry] >= end_tile:
+                following = np.int64(order[place + 1]) * area
+                for j in range(0, min(area * shape.channels, _AHEAD), 64 // size):
+                    prefetch(textures.features, following * shape.channels + j)
+                for j in range(0, min(area, _AHEAD), 64 // size):
+                    prefetch(textures.alpha, following + j)
+            for entry in range(entry_start[place], entry_start[place + 1]):
+                tile = entry_tile[entry]
+                if tile < part.first_tile or tile >= part.end_tile:
                     continue
-                noted = made[tile[entry]] - base
-                left, top = tile[entry] % across * TILE_WIDTH, tile[entry] // across * TILE_HEIGHT
-                there = ahead(grads, (np.int64(top) * width + left) * stride)
-                if entry + 1 < first[order + 1]:  # and the notes of the next tile
-                    at = get(ranges, 2 * where[entry + 1]) + made[tile[entry + 1]] - base
-                    for j in range(0, _NOTES * 2 * LANES, 64 // alpha_.itemsize):
-                        prefetch(notes, 2 * LANES * at + j)
-                for band in range(bands):
-                    at = 2 * (band * len(where) + where[entry])
-                    for bundle in range(noted + get(ranges, at), noted + get(ranges, at + 1)):
-                        share, by_a = load(notes, 2 * LANES * bundle), load(notes, 2 * LANES * bundle + LANES)
-                        hit = (share > none) | (by_a > none) | (by_a < none)
-                        if not any_lane(hit):
+                taped = tile_bundle[tile] - tape.first
+                left, top = tile % across * TILE_WIDTH, tile // across * TILE_HEIGHT
+                tile_adjoints = advance(adjoints, (np.int64(top) * width + left) * layout.stride)
+                if entry + 1 < entry_start[place + 1]:  # and the tape of the next tile
+                    at = get(tape.ranges, 2 * position[entry + 1]) + tile_bundle[entry_tile[entry + 1]] - tape.first
+                    for j in range(0, _AHEAD_TAPE * 2 * LANES, 64 // size):
+                        prefetch(tape.values, 2 * LANES * at + j)
+                for band in range(part.bands):
+                    at = 2 * (band * len(position) + position[entry])
+                    for bundle in range(taped + get(tape.ranges, at), taped + get(tape.ranges, at + 1)):
+                        values = advance(tape.values, 2 * LANES * bundle)
+                        weight, dL_da = load(values, 0), load(values, LANES)
+                        hit_mask = (weight > zeros) | (dL_da > zeros) | (dL_da < zeros)
+                        if not any_lane(hit_mask):
                             continue
                         if not used:
                             used = True
                             for j in range(area):
-                                put(alphas, j, zero)
-                            for j in range(area * stride):
-                                put(totals, j, zero)
-                        spot = load(spots, LANES * bundle)
-                        dx = to_real((spot & spread(np.int32(COLUMN))) + spread(np.int32(left - x_origin)), zero)
-                        dy = to_real((spot >> spread(np.int32(ROW))) + spread(np.int32(top - y_origin)), zero)
-                        s, t, p, _ = intersect(patch, dx, dy, common)
-                        foot = footprint(s, t, common)
-                        cell = cells(foot, texels)
-                        a0, a1 = slopes(s, foot.column, common.step, none, common.one)
-                        b0, b1 = slopes(t, foot.row, common.step, none, common.one)
-                        t00, t01, t10, t11 = corners(pointer(alpha_, i * area), cell, step, step * texels)
-                        sample = mix(t00, t01, t10, t11, foot.x0, foot.x1, foot.y0, foot.y1)
-                        moves = hit & (patch.fade * sample <= common.alpha_max)  # a capped alpha does not
-                        by_a = choose(moves, by_a, none)
-                        g_fade = g_fade + by_a * sample
-                        by_a = by_a * patch.fade
-                        by_s = by_a * mix(t00, t01, t10, t11, a0, a1, foot.y0, foot.y1)
-                        by_t = by_a * mix(t00, t01, t10, t11, foot.x0, foot.x1, b0, b1)
-                        for j, w in enumerate((share, by_a)):
-                            at_row = 4 * LANES * j
-                            store(k, at_row, w * foot.y0 * foot.x0)
-                            store(k, at_row + LANES, w * foot.y0 * foot.x1)
-                            store(k, at_row + 2 * LANES, w * foot.y1 * foot.x0)
-                            store(k, at_row + 3 * LANES, w * foot.y1 * foot.x1)
-                        store(k, 12 * LANES, foot.row * spread(zero + np.float32(texels)) + foot.column)
-                        _texels(bits(hit), k, there, width, ahead(spots, LANES * bundle),
-                                pointer(features_, i * area * channels), totals, alphas,
-                                channels, stride, step, step * texels, zero)  # fmt: skip
-                        d00, d01, d10, d11 = (
-                            load(k, 8 * LANES), load(k, 9 * LANES), load(k, 10 * LANES), load(k, 11 * LANES),
-                        )  # fmt: skip
-                        by_s = by_s + share * mix(d00, d01, d10, d11, a0, a1, foot.y0, foot.y1)
-                        by_t = by_t + share * mix(d00, d01, d10, d11, foot.x0, foot.x1, b0, b1)
-                        gs, gt, gw = plane_slopes(
-                            choose(hit, by_s, none), choose(hit, by_t, none), s - middle, t - middle, p
+                                put(scratch.dL_dalpha, j, zero)
+                            for j in range(area * layout.stride):
+                                put(scratch.dL_dfeature, j, zero)
+                        pixel = load(tape.pixels, LANES * bundle)
+                        dx = to_real((pixel & broadcast(np.int32(COLUMN))) + broadcast(np.int32(left - x_origin)), zero)
+                        dy = to_real((pixel >> broadcast(np.int32(ROW))) + broadcast(np.int32(top - y_origin)), zero)
+                        s, t, p, _ = intersect(patch, dx, dy, lanes)
+                        foot = footprint(s, t, lanes)
+                        x0_slope, x1_slope = slopes(s, foot.column, lanes.step, zeros, lanes.one)
+                        y0_slope, y1_slope = slopes(t, foot.row, lanes.step, zeros, lanes.one)
+                        t00, t01, t10, t11 = corners(
+                            advance(textures.alpha, i * area), first_texels(foot, texels), step, step * texels
                         )
-                        s_x, s_y, s_1 = s_x + gs * dx, s_y + gs * dy, s_1 + gs
-                        t_x, t_y, t_1 = t_x + gt * dx, t_y + gt * dy, t_1 + gt
-                        w_x, w_y, w_1 = w_x + gw * dx, w_y + gw * dy, w_1 + gw
-            grad_features = pointer(grad_features_, i * area * channels)
-            grad_alpha = pointer(grad_alpha_, i * area)
-            if fresh:
+                        sample = mix(t00, t01, t10, t11, foot.x0, foot.x1, foot.y0, foot.y1)
+                        moves = hit_mask & (patch.fade * sample <= lanes.alpha_max)  # a capped alpha does not
+                        dL_da = select(moves, dL_da, zeros)
+                        dL_dfade = dL_dfade + dL_da * sample
+                        dL_dsample = dL_da * patch.fade
+                        dL_ds = dL_dsample * mix(t00, t01, t10, t11, x0_slope, x1_slope, foot.y0, foot.y1)
+                        dL_dt = dL_dsample * mix(t00, t01, t10, t11, foot.x0, foot.x1, y0_slope, y1_slope)
+                        for j, factor in enumerate((weight, dL_dsample)):
+                            target = advance(scratch.corner_weight, 4 * LANES * j)
+                            store(target, 0, factor * foot.y0 * foot.x0)
+                            store(target, LANES, factor * foot.y0 * foot.x1)
+                            store(target, 2 * LANES, factor * foot.y1 * foot.x0)
+                            store(target, 3 * LANES, factor * foot.y1 * foot.x1)
+                        store(scratch.texel, 0, foot.row * broadcast(zero + np.float32(texels)) + foot.column)
+                        _add_hits(
+                            mask_bits(hit_mask), scratch, tile_adjoints, width, advance(tape.pixels, LANES * bundle),
+                            advance(textures.features, i * area * shape.channels), layout, zero,
+                        )  # fmt: skip
+                        d00, d01 = load(scratch.product, 0), load(scratch.product, LANES)
+                        d10, d11 = load(scratch.product, 2 * LANES), load(scratch.product, 3 * LANES)
+                        dL_ds = dL_ds + weight * mix(d00, d01, d10, d11, x0_slope, x1_slope, foot.y0, foot.y1)
+                        dL_dt = dL_dt + weight * mix(d00, d01, d10, d11, foot.x0, foot.x1, y0_slope, y1_slope)
+                        dL_dps, dL_dpt, dL_dpw = plane_slopes(
+                            select(hit_mask, dL_ds, zeros), select(hit_mask, dL_dt, zeros), s - middle, t - middle, p
+                        )
+                        s_x, s_y, s_1 = s_x + dL_dps * dx, s_y + dL_dps * dy, s_1 + dL_dps
+                        t_x, t_y, t_1 = t_x + dL_dpt * dx, t_y + dL_dpt * dy, t_1 + dL_dpt
+                        w_x, w_y, w_1 = w_x + dL_dpw * dx, w_y + dL_dpw * dy, w_1 + dL_dpw
+            grad_features = advance(gradients.features, i * area * shape.channels)
+            grad_alpha = advance(gradients.alpha, i * area)
+            if part.fresh:
                 for j in range(9):
                     grad_plane[i, j // 3, j % 3] = 0.0
                 grad_fade[i] = 0.0
             if used:
-                _hand_over(totals, alphas, grad_features, grad_alpha, area, channels, stride, fresh)
-            elif fresh:
-                for j in range(area * channels):
+                _hand_over(scratch, grad_features, grad_alpha, layout, part.fresh)
+            elif part.fresh:
+                for j in range(area * shape.channels):
                     put(grad_features, j, zero)
                 for j in range(area):
                     put(grad_alpha, j, zero)
@@ -275,9 +305,9 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
                 continue
             # from texel coordinates about the record's origin to texture coordinates about the image's
             ox, oy = x_origin + 0.5, y_origin + 0.5
-            s_x1, s_y1, s_11 = np.float64(total(s_x)), np.float64(total(s_y)), np.float64(total(s_1))
-            t_x1, t_y1, t_11 = np.float64(total(t_x)), np.float64(total(t_y)), np.float64(total(t_1))
-            w_x1, w_y1, w_11 = np.float64(total(w_x)), np.float64(total(w_y)), np.float64(total(w_1))
+            s_x1, s_y1, s_11 = np.float64(sum_lanes(s_x)), np.float64(sum_lanes(s_y)), np.float64(sum_lanes(s_1))
+            t_x1, t_y1, t_11 = np.float64(sum_lanes(t_x)), np.float64(sum_lanes(t_y)), np.float64(sum_lanes(t_1))
+            w_x1, w_y1, w_11 = np.float64(sum_lanes(w_x)), np.float64(sum_lanes(w_y)), np.float64(sum_lanes(w_1))
             s_x1, s_y1 = s_x1 + s_11 * ox, s_y1 + s_11 * oy
             t_x1, t_y1 = t_x1 + t_11 * ox, t_y1 + t_11 * oy
             w_x1, w_y1 = w_x1 + w_11 * ox, w_y1 + w_11 * oy
@@ -290,4 +320,4 @@ def gather_gradients(turn, chunk, first_tile, end_tile, bands, sequence, first, 
             grad_plane[i, 2, 0] += w_x1
             grad_plane[i, 2, 1] += w_y1
             grad_plane[i, 2, 2] += w_11
-            grad_fade[i] += np.float64(total(g_fade))
+            grad_fade[i] += np.float64(sum_lanes(dL_dfade))

@@ -8,15 +8,22 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-import numpy as np
 import torch
 from numba import types
 from torch import Tensor
 
 from nbavatar.jit.compile import prepare
 from nbavatar.jit.workers import run_workers
-from nbavatar.rendering.billboards.cpu_projection_kernels import project, project_back
+from nbavatar.rendering.billboards.cpu_projection_kernels import (
+    Adjoints,
+    Billboards,
+    Camera,
+    Projected,
+    project,
+    project_back,
+)
 from nbavatar.rendering.patches import ProjectedPatches
+from nbavatar.rendering.scratch import array_of
 
 __all__ = ["project_billboards_cpu"]
 
@@ -40,13 +47,13 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quats, half_extents, viewmat, K, near, low_pass, support):
         ctx.save_for_backward(means, quats, half_extents, viewmat, K)
-        ctx.limits = (near, low_pass)
+        ctx.options = (near, low_pass, support)
         count = len(means)
         shapes = ((3, 3), (), (), (), (4,))
         plane, fade, depth, nearest, bounds = (torch.empty(count, *shape, dtype=torch.float64) for shape in shapes)
-        inputs = _numbers(means, quats, half_extents, viewmat, K)
-        results = [tensor.numpy() for tensor in (plane, fade, depth, nearest, bounds)]
-        _share(count, lambda first, end: project(first, end, *inputs, near, low_pass, support, *results))
+        inputs = _arguments(means, quats, half_extents, viewmat, K, ctx.options)
+        projected = Projected(*(tensor.numpy() for tensor in (plane, fade, depth, nearest, bounds)))
+        _share(count, lambda first, end: project(first, end, *inputs, projected))
         ctx.mark_non_differentiable(depth, nearest, bounds)
         return plane, fade, depth, nearest, bounds
 
@@ -54,19 +61,22 @@ class _Project(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_plane, grad_fade, *_):
         saved = ctx.saved_tensors
-        inputs, grads = _numbers(*saved), [grad.double().contiguous().numpy() for grad in (grad_plane, grad_fade)]
+        inputs = _arguments(*saved, ctx.options)
+        adjoints = Adjoints(*(grad.double().contiguous().numpy() for grad in (grad_plane, grad_fade)))
         results = [torch.empty(tensor.shape, dtype=torch.float64) for tensor in saved[:3]]
-        arrays = [tensor.numpy() for tensor in results]
-        _share(len(saved[0]), lambda first, end: project_back(first, end, *inputs, *ctx.limits, *grads, *arrays))
+        gradients = Billboards(*(tensor.numpy() for tensor in results))
+        _share(len(saved[0]), lambda first, end: project_back(first, end, *inputs, adjoints, gradients))
         return *(result.to(tensor.dtype) for result, tensor in zip(results, saved, strict=False)), *[None] * 5
 
 
-def _numbers(means: Tensor, quats: Tensor, half_extents: Tensor, viewmat: Tensor, K: Tensor) -> list[np.ndarray]:
-    """Arguments of the kernels: float64, the intrinsics as fx, skew, cx, fy, cy."""
+def _arguments(
+    means: Tensor, quats: Tensor, half_extents: Tensor, viewmat: Tensor, K: Tensor, options: tuple[float, float, float]
+) -> tuple[Billboards, Camera]:
+    """What both kernels take."""
     _prepare()
-    tensors = [means, quats, half_extents, viewmat]
+    wide = [tensor.detach().double().contiguous().numpy() for tensor in (means, quats, half_extents, viewmat)]
     intrinsics = K.detach().double().numpy()[[0, 0, 0, 1, 1], [0, 1, 2, 1, 2]]
-    return [*(tensor.detach().double().contiguous().numpy() for tensor in tensors), intrinsics]
+    return Billboards(*wide[:3]), Camera(wide[3], intrinsics, *(float(option) for option in options))
 
 
 def _share(count: int, work: Callable[[int, int], Any]) -> None:
@@ -77,20 +87,16 @@ def _share(count: int, work: Callable[[int, int], Any]) -> None:
 
 @cache
 def _prepare() -> None:
-    def array(dimensions: int):
-        return types.Array(types.float64, dimensions, "C")
+    def group(kind: type, *dimensions: int) -> Any:
+        """A named tuple's type; a member of no dimension is a number."""
+        arrays = [array_of(types.float64, count) if count else types.float64 for count in dimensions]
+        return types.BaseTuple.from_types(arrays, kind)
 
-    i64, f64 = types.int64, types.float64
+    billboards, camera = group(Billboards, 2, 2, 2), group(Camera, 2, 1, 0, 0, 0)
     prepare(
         "billboards-projection",
         {
-            project: (
-                i64, i64, array(2), array(2), array(2), array(2), array(1), f64, f64, f64, array(3), array(1),
-                array(1), array(1), array(2),
-            ),
-            project_back: (
-                i64, i64, array(2), array(2), array(2), array(2), array(1), f64, f64, array(3), array(1), array(2),
-                array(2), array(2),
-            ),
+            project: (types.int64, types.int64, billboards, camera, group(Projected, 3, 1, 1, 1, 2)),
+            project_back: (types.int64, types.int64, billboards, camera, group(Adjoints, 3, 1), billboards),
         },
-    )  # fmt: skip
+    )

@@ -1,7 +1,7 @@
 """CUDA backend: Numba-CUDA kernels behind a torch autograd function.
 
 Kernels run on torch's current stream. The host waits for the device once in the forward pass (how
-many entries the tiles' lists have) and once in the backward pass (how many hits it has to note);
+many entries the tiles' lists have) and once in the backward pass (how many hits it has to record);
 the exact order itself needs no such wait. Forward results are the same on every run; gradients are
 summed by atomic additions, whose order is not fixed, and differ from run to run by rounding.
 
@@ -16,7 +16,7 @@ A NaN in an alpha texture is a sample that is skipped: looking for it would make
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from torch import Tensor
 
 from nbavatar.errors import DependencyError, DeviceError, require
 from nbavatar.packages import install_line
+from nbavatar.rendering.billboards.cuda_arguments import Bins, Constants, Gradients, Images, Shape, Tape, Textures
 from nbavatar.rendering.billboards.reference import BlendSettings
 from nbavatar.rendering.patches import ProjectedPatches
 
@@ -43,7 +44,7 @@ __all__ = ["blend_cuda", "overflowed"]
 
 _QUEUE = 16  # hits that may wait at a pixel in `ray` order; more cost further rounds
 _LONGEST = 255  # longest queue of `kbuffer(n)`: it lives in a thread's local memory
-_NOTES = 1 << 27  # hits noted at once in the backward pass: 2 GiB in float32
+_TAPE = 1 << 27  # hits on the tape at once: 2 GiB in float32
 
 _Size = tuple[str, torch.device, int, int, int]  # what is counted, device, billboards, width, height
 _SIZES: dict[_Size, int] = {}  # largest number seen outside a capture
@@ -79,6 +80,13 @@ def overflowed(device: torch.device | str = "cuda") -> bool:
     return found
 
 
+def _views(argument: Any, view: Callable[[Tensor], Any]) -> Any:
+    """An argument of a kernel with a view in place of each tensor, in named tuples too."""
+    if isinstance(argument, tuple):
+        return type(argument)(*(_views(member, view) for member in argument))
+    return view(argument) if isinstance(argument, Tensor) else argument
+
+
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, plane, fade, features, alpha, projection, rank, settings):
@@ -110,9 +118,9 @@ class _Scene:
         self.features, self.alpha = features.detach(), alpha.detach()
         self.across, self.down = -(-s.width // TILE), -(-s.height // TILE)
         self.mode, self.capacity = self._order()
-        limits = (0, 1, self.texels, min(1, self.texels - 1), 1 / s.near, s.alpha_min, s.t_min, s.alpha_max)
-        real = np.float64 if self.double else np.float32
-        self.real, self.limits = real, tuple(real(value) for value in limits)
+        numbers = (0, 1, self.texels, min(1, self.texels - 1), 1 / s.near, s.alpha_min, s.t_min, s.alpha_max)
+        self.real: Any = np.float64 if self.double else np.float32
+        self.constants = Constants(*(self.real(number) for number in numbers))
         self.status = _STATUS.get(self.device)
         if self.status is None:
             self.status = _STATUS[self.device] = self._zeros(1, dtype=torch.int32)
@@ -145,37 +153,37 @@ class _Scene:
         return number
 
     def _bin(self, projection: ProjectedPatches, rank: Tensor) -> None:
-        """Writes the billboards' records and the tiles' lists; see `cuda_kernels` and `binning.Bins`."""
+        """Writes the billboards' records and the tiles' lists; see `cuda_arguments.Bins`."""
         s, count = self.settings, self.count
         plane, fade = projection.plane.detach().contiguous(), projection.fade.detach().contiguous()
         nearest, bounds = projection.nearest.contiguous(), projection.bounds.contiguous()
         seen = (bounds[:, 0] <= bounds[:, 2]) & (projection.depth > 0)
         median = torch.where(seen, projection.depth, torch.nan).nanmedian().nan_to_num(nan=1.0)
         reference = median.reciprocal().reshape(1)
-        self.record = self._zeros(count * RECORD)
-        self.box = self._zeros(count, 4, dtype=torch.int32)
+        record = self._zeros(count * RECORD)
+        box = self._zeros(count, 4, dtype=torch.int32)
         counts = self._zeros(count, dtype=torch.int64)
         blocks = -(-count // 128)
         with self._launcher() as launch:
             launch(count_tiles, blocks, 128, plane, fade, nearest, bounds, reference, self.texels, s.width,
-                   s.height, s.support, self.record, self.box, counts)  # fmt: skip
-        self.place = self._zeros(count, dtype=torch.int32)
-        self.place[rank] = torch.arange(count, dtype=torch.int32, device=self.device)
+                   s.height, s.support, record, box, counts)  # fmt: skip
+        ranks = self._zeros(count, dtype=torch.int32)
+        ranks[rank] = torch.arange(count, dtype=torch.int32, device=self.device)
         by_nearest = self.mode == kernels.RAY
-        sequence = rank[torch.sort(nearest[rank], stable=True).indices] if by_nearest else rank.contiguous()
-        ends = counts[sequence].cumsum(0)
+        order = rank[torch.sort(nearest[rank], stable=True).indices] if by_nearest else rank.contiguous()
+        ends = counts[order].cumsum(0)
         entries = self._bounded("tile entries", ends[-1])
         self._require_memory(64 * entries, f"the tile lists of {count} billboards ({entries} entries)")
         tiles = torch.full((max(entries, 1),), self.across * self.down, dtype=torch.int32, device=self.device)
         members = self._zeros(max(entries, 1), dtype=torch.int32)
         with self._launcher() as launch:
-            launch(fill_tiles, blocks, 128, plane, self.box, sequence, ends, s.support, self.across, tiles,
+            launch(fill_tiles, blocks, 128, plane, box, order, ends, s.support, self.across, tiles,
                    members, self.status)  # fmt: skip
-        # stable: within a tile the order of `sequence` stays
-        tiles, order = torch.sort(tiles, stable=True)
-        self.members = members[order]
+        # stable: within a tile `order` stays
+        tiles, places = torch.sort(tiles, stable=True)
         edges = torch.arange(self.across * self.down + 1, dtype=torch.int32, device=self.device)
-        self.start = torch.searchsorted(tiles, edges, out_int32=True)
+        start = torch.searchsorted(tiles, edges, out_int32=True)
+        self.bins = Bins(start, members[places], record, box, ranks)
 
     @contextlib.contextmanager
     def _launcher(self) -> Iterator[Any]:
@@ -184,7 +192,7 @@ class _Scene:
         if self.device.type != "cuda":  # numba's simulator
 
             def simulate(kernel: Any, blocks: int, threads: int, *arguments: Any) -> None:
-                kernel[blocks, threads](*(a.numpy() if isinstance(a, Tensor) else a for a in arguments))
+                kernel[blocks, threads](*(_views(a, lambda tensor: tensor.numpy()) for a in arguments))
 
             yield simulate
             return
@@ -192,7 +200,7 @@ class _Scene:
             stream = cuda.external_stream(torch.cuda.current_stream().cuda_stream)
 
             def launch(kernel: Any, blocks: int, threads: int, *arguments: Any) -> None:
-                views = (cuda.as_cuda_array(a, sync=False) if isinstance(a, Tensor) else a for a in arguments)
+                views = (_views(a, lambda tensor: cuda.as_cuda_array(tensor, sync=False)) for a in arguments)
                 kernel[blocks, threads, stream](*views)
 
             yield launch
@@ -209,13 +217,21 @@ class _Scene:
                 found=f"{free / 2**30:.1f} GiB free", fix="render fewer or smaller billboards or a smaller image",
             )  # fmt: skip
 
-    def _traverse(self, replay: bool, first: int, tiles: int, image: Tensor, opacity: Tensor, *rest: Any) -> None:
+    def _traverse(
+        self, replay: bool, first: int, tiles: int, images: Images, tape: Tape | None, gradients: Gradients | None
+    ) -> None:
+        """Runs the forward kernel or that of the replay on tiles from `first` on."""
         s = self.settings
         kernel = kernels.traverse(self.real, self.channels, self.capacity, self.mode, replay)
+        textures = Textures(self._flat(self.features), self._flat(self.alpha))
+        shape = Shape(self.texels, s.width, s.height, self.across, s.queue)
+        images = images._replace(features=self._flat(images.features), opacity=self._flat(images.opacity))
+        nothing, i32 = self._zeros(1), self._zeros(1, dtype=torch.int32)
+        tape = tape or Tape(self._zeros(1, dtype=torch.int64), 0, nothing, i32)
+        gradients = gradients or Gradients(nothing, nothing, self._zeros(1, dtype=torch.float64), self.status)
         with self._launcher() as launch:
-            launch(kernel, tiles, kernels.THREADS, first, self.start, self.members, self.record, self.box, self.place,
-                   self._flat(self.features), self._flat(self.alpha), self.limits, self.texels, s.width, s.height,
-                   self.across, s.queue, self._flat(image), self._flat(opacity), self.hits, *rest)  # fmt: skip
+            launch(kernel, tiles, kernels.THREADS, first, self.bins, textures, self.constants, shape, images, tape,
+                   gradients)  # fmt: skip
 
     def _flat(self, tensor: Tensor) -> Tensor:
         """One dimension, and never without elements: such an array has no address."""
@@ -226,10 +242,7 @@ class _Scene:
         image, opacity = self._zeros(self.channels, s.height, s.width), self._zeros(s.height, s.width)
         self.hits = self._zeros(s.height * s.width, dtype=torch.int32)
         if self.count:
-            nothing, whole = self._zeros(1), self._zeros(1, dtype=torch.int32)
-            self._traverse(False, 0, self.across * self.down, image, opacity, self._zeros(1, dtype=torch.int64), 0,
-                           nothing, whole, nothing, nothing, self._zeros(1, dtype=torch.float64),
-                           self.status)  # fmt: skip
+            self._traverse(False, 0, self.across * self.down, Images(image, opacity, self.hits), None, None)
         return image, opacity
 
     def backward(self, grad_image: Tensor, grad_opacity: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -241,33 +254,34 @@ class _Scene:
         if self.count:
             ends = self.hits.cumsum(0, dtype=torch.int64)
             sums = self._zeros(self.count * kernels.SUMS, dtype=torch.float64)
-            grad_image, grad_opacity = (g.to(self.dtype).contiguous() for g in (grad_image, grad_opacity))
+            adjoints = Images(*(g.to(self.dtype).contiguous() for g in (grad_image, grad_opacity)), self.hits)
+            gradients = Gradients(self._flat(grad_features), self._flat(grad_alpha), sums, self.status)
             groups = self._groups(ends)
             largest = max(1, *(hits for _, _, _, hits in groups))
             self._require_memory(largest * (12 * (1 + self.double) + 4), f"{largest} hits in the backward pass")
-            tape, who = self._zeros(3 * largest), self._zeros(largest, dtype=torch.int32)
+            values, primitives = self._zeros(3 * largest), self._zeros(largest, dtype=torch.int32)
             for first, rows, base, _ in groups:
-                self._traverse(True, first * self.across, rows * self.across, grad_image, grad_opacity, ends, base,
-                               tape, who, self._flat(grad_features), self._flat(grad_alpha), sums,
-                               self.status)  # fmt: skip
+                tape = Tape(ends, base, values, primitives)
+                self._traverse(True, first * self.across, rows * self.across, adjoints, tape, gradients)
             with self._launcher() as launch:
-                launch(kernels.finish, -(-self.count // 128), 128, sums, self.box, self.texels, grad_plane, grad_fade)
+                box = self.bins.box
+                launch(kernels.finish, -(-self.count // 128), 128, sums, box, self.texels, grad_plane, grad_fade)
         return grad_features.to(self.features.dtype), grad_alpha.to(self.alpha.dtype), grad_plane, grad_fade
 
     def _groups(self, ends: Tensor) -> list[tuple[int, int, int, int]]:
-        """Rows of tiles whose hits are noted together: first row, rows, hits before them, hits."""
+        """Rows of tiles whose hits are recorded together: first row, rows, hits before them, hits."""
         total = self._bounded("hits", ends[-1])
-        if total <= _NOTES:
+        if total <= _TAPE:
             return [(0, self.down, 0, total)]
         if self.device.type == "cuda" and torch.cuda.is_current_stream_capturing():
-            raise DeviceError.of("render_billboards", "CUDA graph", expected=f"at most {_NOTES} hits to note",
+            raise DeviceError.of("render_billboards", "CUDA graph", expected=f"at most {_TAPE} hits to record",
                                  found=f"room for {total}", fix="capture the forward pass alone")  # fmt: skip
         s = self.settings
         rows = torch.arange(1, self.down + 1, device=self.device) * TILE
         behind = ends[rows.clamp_max(s.height) * s.width - 1].tolist()
         groups, first, base, last = [], 0, 0, 0
         for row, end in enumerate(behind):
-            if row > first and end - base > _NOTES:
+            if row > first and end - base > _TAPE:
                 groups.append((first, row - first, base, last - base))
                 first, base = row, last
             last = end

@@ -8,7 +8,7 @@ through the list once more, from that hit on: the order is exact however many hi
 fixed memory and without a word to the host. With a queue that gives up its nearest hit instead,
 the same loop gives `kbuffer(n)` and `center`.
 
-The backward kernel repeats the loop, notes its hits on a tape and walks them from back to front,
+The replay repeats the loop, records its hits on a tape and walks them from back to front,
 which needs no division by a transmittance. It sums gradients by atomic additions, whose order is
 not fixed: results differ from run to run by rounding.
 """
@@ -24,6 +24,7 @@ import numpy as np
 from numba import cuda
 
 from nbavatar.jit import scalar
+from nbavatar.rendering.billboards.cuda_arguments import Footprint, Queue, Scene
 from nbavatar.rendering.binning import RECORD
 from nbavatar.rendering.cuda_binning import TILE
 
@@ -91,14 +92,8 @@ def traverse(real: Any, channels: int, capacity: int, mode: int, replay: bool) -
         replay: whether to compute the gradients.
 
     Returns:
-        Kernel for THREADS threads a block and a block a tile, with arguments
-        `first_tile`; `start` (tiles + 1,), `members` (E,) the tiles' lists; `record`, `box`, `place` (F,);
-        `features`, `alpha` flat textures of any floating type; `limits`: zero, one, texels a side,
-        min(1, texels - 1), 1 / near, alpha_min, t_min, alpha_max; `texels`, `width`, `height`, `across`
-        (tiles), `queue`; `image` (C H W,), `opacity` (H W,), `hits` (H W,) int32: results, or in the
-        replay the gradients by the first two and what was counted; and for the replay `ends` (H W,)
-        int64, running number of hits, `base` those before the tape begins, `tape` (3 hits,), `who`
-        (hits,) int32, `grad_features`, `grad_alpha` flat, `sums` (SUMS F,) float64, `status` (1,).
+        Kernel for THREADS threads a block and a block a tile, with arguments `first_tile` and `bins`, `textures`,
+        `constants`, `shape`, `images`, `tape`, `gradients` (see `cuda_arguments`); the replay uses the last two.
     """
     scalars = scalar.build(_device, _floor, _minimum, _maximum, _select)
     affine, first_texel, weights = scalars.affine, scalars.first_texel, scalars.weights
@@ -106,20 +101,29 @@ def traverse(real: Any, channels: int, capacity: int, mode: int, replay: bool) -
     mask, room = capacity - 1, max(channels, 1)
 
     @_device
-    def locate(record, r, dx, dy, limits):
-        """Texel coordinates under a pixel, 1 / inverse depth, and whether there is anything in front."""
-        zero, one, inverse_near = limits[0], limits[1], limits[4]
+    def intersect(record, r, dx, dy, constants):
+        """Whether there is anything in front, texel coordinates under a pixel, 1 / inverse depth."""
+        zero, one = constants.zero, constants.one
         w = affine(record[r + 6], record[r + 7], record[r + 8], dx, dy)
-        hit = w > zero and w <= inverse_near
+        hit = w > zero and w <= constants.inverse_near
         p = one / w if hit else one
         s = affine(record[r], record[r + 1], record[r + 2], dx, dy) * p
         t = affine(record[r + 3], record[r + 4], record[r + 5], dx, dy) * p
         return hit, s, t, p
 
     @_device
-    def corners(member, column, row, step, texels):
+    def footprint(s, t, constants):
+        """Texels and weights of a hit."""
+        zero, one = constants.zero, constants.one
+        column, row = first_texel(s, constants.size, zero, one), first_texel(t, constants.size, zero, one)
+        x0, x1 = weights(s, column, constants.step, zero, one)
+        y0, y1 = weights(t, row, constants.step, zero, one)
+        return Footprint(column, row, x0, x1, y0, y1)
+
+    @_device
+    def corners(billboard, foot, step, texels):
         """Index of the first texel, and what to add for the texels to the right and below."""
-        first = (np.int64(member) * texels + np.int64(row)) * texels + np.int64(column)
+        first = (np.int64(billboard) * texels + np.int64(foot.row)) * texels + np.int64(foot.column)
         right = np.int64(step)
         return first, right, right * texels
 
@@ -129,212 +133,215 @@ def traverse(real: Any, channels: int, capacity: int, mode: int, replay: bool) -
                    real(alpha[first + below + right]), x0, x1, y0, y1)  # fmt: skip
 
     @_device
-    def emit(slot, at_s, at_t, opacities, waiting, through, number, colour, features, limits, texels, image, opacity,
-             pixel, pixels, at, allotted, tape, who):  # fmt: skip
-        """Blends the hit in a slot, or notes it; returns the transmittance behind it."""
-        zero, one, size, step = limits[0], limits[1], limits[2], limits[3]
-        s, t, member = at_s[slot], at_t[slot], waiting[slot]
-        a = _minimum(opacities[slot], limits[7])
-        column, row = first_texel(s, size, zero, one), first_texel(t, size, zero, one)
-        x0, x1 = weights(s, column, step, zero, one)
-        y0, y1 = weights(t, row, step, zero, one)
-        first, right, below = corners(member, column, row, step, texels)
+    def blend(queue, slot, transmittance, number, colour, scene, pixel, first_taped, allotted):
+        """Blends the hit in a slot, or records it on the tape; returns the transmittance behind it.
+
+        `number` is that of the hit at this pixel, whose hits have `allotted` places on the tape from `first_taped` on.
+        """
+        constants, shape, features, tape = scene.constants, scene.shape, scene.textures.features, scene.tape
+        billboard = queue.billboard[slot]
+        a = _minimum(queue.alpha[slot], constants.alpha_max)
+        foot = footprint(queue.s[slot], queue.t[slot], constants)
+        first, right, below = corners(billboard, foot, constants.step, shape.texels)
         first, right, below = first * channels, right * channels, below * channels
-        worth = zero
+        pixels = np.int64(shape.width) * shape.height
+        dL_dweight = constants.zero
         for c in range(channels):
             value = mix(real(features[first + c]), real(features[first + right + c]),
                         real(features[first + below + c]), real(features[first + below + right + c]),
-                        x0, x1, y0, y1)  # fmt: skip
+                        foot.x0, foot.x1, foot.y0, foot.y1)  # fmt: skip
             if replay:
-                worth += image[np.int64(c) * pixels + pixel] * value
+                dL_dweight += scene.images.features[np.int64(c) * pixels + pixel] * value
             else:
-                colour[c] += through * a * value
+                colour[c] += transmittance * a * value
         # The two kernels may round differently: a hit that the forward pass did not count has no place on the tape.
         if replay and number < allotted:
-            spot = at + number
-            tape[3 * spot] = worth + opacity[pixel]
-            tape[3 * spot + 1] = a
-            tape[3 * spot + 2] = through
-            who[spot] = member
-        return through * (one - a)
+            at = first_taped + number
+            tape.values[3 * at] = dL_dweight + scene.images.opacity[pixel]
+            tape.values[3 * at + 1] = a
+            tape.values[3 * at + 2] = transmittance
+            tape.primitives[at] = billboard
+        return transmittance * (constants.one - a)
 
     @_device
-    def spread(member, worth, a, through, behind, x, y, record, box, features, alpha, limits, texels, image, pixel,
-               pixels, grad_features, grad_alpha, sums):  # fmt: skip
-        """Adds one hit's gradients; returns what the pixel is worth from this hit on."""
-        zero, one, size, step, alpha_max = limits[0], limits[1], limits[2], limits[3], limits[7]
-        w, by_a = through * a, through * (worth - behind)
-        r = member * RECORD
-        dx, dy = real(x - (box[member, 0] + box[member, 2]) // 2), real(y - (box[member, 1] + box[member, 3]) // 2)
+    def scatter(at, suffix, x, y, scene):
+        """Adds the gradients of the hit at a place on the tape; returns the suffix sum from this hit on."""
+        constants, shape, adjoints, tape = scene.constants, scene.shape, scene.images.features, scene.tape
+        features, alpha, gradients = scene.textures.features, scene.textures.alpha, scene.gradients
+        record, box, sums = scene.bins.record, scene.bins.box, gradients.sums
+        zero, one = constants.zero, constants.one
+        billboard = tape.primitives[at]
+        dL_dweight, a, transmittance = tape.values[3 * at], tape.values[3 * at + 1], tape.values[3 * at + 2]
+        weight, dL_da = transmittance * a, transmittance * (dL_dweight - suffix)
+        pixel, pixels = np.int64(y) * shape.width + x, np.int64(shape.width) * shape.height
+        r = billboard * RECORD
+        dx = real(x - (box[billboard, 0] + box[billboard, 2]) // 2)
+        dy = real(y - (box[billboard, 1] + box[billboard, 3]) // 2)
         fade = record[r + 10]
-        _, s, t, p = locate(record, r, dx, dy, limits)
-        column, row = first_texel(s, size, zero, one), first_texel(t, size, zero, one)
-        x0, x1 = weights(s, column, step, zero, one)
-        y0, y1 = weights(t, row, step, zero, one)
-        a0, a1 = slopes(s, column, step, zero, one)
-        b0, b1 = slopes(t, row, step, zero, one)
-        first, right, below = corners(member, column, row, step, texels)
+        _, s, t, p = intersect(record, r, dx, dy, constants)
+        foot = footprint(s, t, constants)
+        x0, x1, y0, y1 = foot.x0, foot.x1, foot.y0, foot.y1
+        x0_slope, x1_slope = slopes(s, foot.column, constants.step, zero, one)
+        y0_slope, y1_slope = slopes(t, foot.row, constants.step, zero, one)
+        first, right, below = corners(billboard, foot, constants.step, shape.texels)
         raw = sample(alpha, first, right, below, x0, x1, y0, y1)
-        by_s, by_t = zero, zero
-        if fade * raw <= alpha_max:  # a capped alpha does not move
-            cuda.atomic.add(sums, SUMS * member + 9, np.float64(by_a * raw))
-            by_a = by_a * fade
-            by_s = by_a * sample(alpha, first, right, below, a0, a1, y0, y1)
-            by_t = by_a * sample(alpha, first, right, below, x0, x1, b0, b1)
-            cuda.atomic.add(grad_alpha, first, by_a * y0 * x0)
-            cuda.atomic.add(grad_alpha, first + right, by_a * y0 * x1)
-            cuda.atomic.add(grad_alpha, first + below, by_a * y1 * x0)
-            cuda.atomic.add(grad_alpha, first + below + right, by_a * y1 * x1)
+        dL_ds, dL_dt = zero, zero
+        if fade * raw <= constants.alpha_max:  # a capped alpha does not move
+            cuda.atomic.add(sums, SUMS * billboard + 9, np.float64(dL_da * raw))
+            dL_dsample = dL_da * fade
+            dL_ds = dL_dsample * sample(alpha, first, right, below, x0_slope, x1_slope, y0, y1)
+            dL_dt = dL_dsample * sample(alpha, first, right, below, x0, x1, y0_slope, y1_slope)
+            cuda.atomic.add(gradients.alpha, first, dL_dsample * y0 * x0)
+            cuda.atomic.add(gradients.alpha, first + right, dL_dsample * y0 * x1)
+            cuda.atomic.add(gradients.alpha, first + below, dL_dsample * y1 * x0)
+            cuda.atomic.add(gradients.alpha, first + below + right, dL_dsample * y1 * x1)
         first, right, below = first * channels, right * channels, below * channels
         for c in range(channels):
             t00, t01 = real(features[first + c]), real(features[first + right + c])
             t10, t11 = real(features[first + below + c]), real(features[first + below + right + c])
-            by_colour = w * image[np.int64(c) * pixels + pixel]
-            by_s += by_colour * mix(t00, t01, t10, t11, a0, a1, y0, y1)
-            by_t += by_colour * mix(t00, t01, t10, t11, x0, x1, b0, b1)
-            cuda.atomic.add(grad_features, first + c, by_colour * y0 * x0)
-            cuda.atomic.add(grad_features, first + right + c, by_colour * y0 * x1)
-            cuda.atomic.add(grad_features, first + below + c, by_colour * y1 * x0)
-            cuda.atomic.add(grad_features, first + below + right + c, by_colour * y1 * x1)
-        middle = (size - one) * real(0.5)  # of a texture: where its plane's coordinates are 0
-        gs, gt, gw = plane_slopes(by_s, by_t, s - middle, t - middle, p)
-        at = SUMS * member
-        cuda.atomic.add(sums, at, np.float64(gs * dx))
-        cuda.atomic.add(sums, at + 1, np.float64(gs * dy))
-        cuda.atomic.add(sums, at + 2, np.float64(gs))
-        cuda.atomic.add(sums, at + 3, np.float64(gt * dx))
-        cuda.atomic.add(sums, at + 4, np.float64(gt * dy))
-        cuda.atomic.add(sums, at + 5, np.float64(gt))
-        cuda.atomic.add(sums, at + 6, np.float64(gw * dx))
-        cuda.atomic.add(sums, at + 7, np.float64(gw * dy))
-        cuda.atomic.add(sums, at + 8, np.float64(gw))
-        return a * worth + (one - a) * behind
+            dL_dfeature = weight * adjoints[np.int64(c) * pixels + pixel]
+            dL_ds += dL_dfeature * mix(t00, t01, t10, t11, x0_slope, x1_slope, y0, y1)
+            dL_dt += dL_dfeature * mix(t00, t01, t10, t11, x0, x1, y0_slope, y1_slope)
+            cuda.atomic.add(gradients.features, first + c, dL_dfeature * y0 * x0)
+            cuda.atomic.add(gradients.features, first + right + c, dL_dfeature * y0 * x1)
+            cuda.atomic.add(gradients.features, first + below + c, dL_dfeature * y1 * x0)
+            cuda.atomic.add(gradients.features, first + below + right + c, dL_dfeature * y1 * x1)
+        middle = (constants.size - one) * real(0.5)  # of a texture: where its plane's coordinates are 0
+        dL_dps, dL_dpt, dL_dpw = plane_slopes(dL_ds, dL_dt, s - middle, t - middle, p)
+        place = SUMS * billboard
+        cuda.atomic.add(sums, place, np.float64(dL_dps * dx))
+        cuda.atomic.add(sums, place + 1, np.float64(dL_dps * dy))
+        cuda.atomic.add(sums, place + 2, np.float64(dL_dps))
+        cuda.atomic.add(sums, place + 3, np.float64(dL_dpt * dx))
+        cuda.atomic.add(sums, place + 4, np.float64(dL_dpt * dy))
+        cuda.atomic.add(sums, place + 5, np.float64(dL_dpt))
+        cuda.atomic.add(sums, place + 6, np.float64(dL_dpw * dx))
+        cuda.atomic.add(sums, place + 7, np.float64(dL_dpw * dy))
+        cuda.atomic.add(sums, place + 8, np.float64(dL_dpw))
+        return a * dL_dweight + (one - a) * suffix
 
     @cuda.jit
-    def kernel(first_tile, start, members, record, box, place, features, alpha, limits, texels, width, height, across,
-               queue, image, opacity, hits, ends, base, tape, who, grad_features, grad_alpha, sums,
-               status):  # fmt: skip
-        at_s, at_t = cuda.local.array(capacity, real), cuda.local.array(capacity, real)
-        keys, opacities = cuda.local.array(capacity, real), cuda.local.array(capacity, real)
-        waiting = cuda.local.array(capacity, np.int32)
+    def kernel(first_tile, bins, textures, constants, shape, images, tape, gradients):
+        queue = Queue(
+            cuda.local.array(capacity, real), cuda.local.array(capacity, real), cuda.local.array(capacity, real),
+            cuda.local.array(capacity, real), cuda.local.array(capacity, np.int32),
+        )  # fmt: skip
         colour = cuda.local.array(room, real)
+        scene = Scene(bins, textures, constants, shape, images, tape, gradients)
         tile = first_tile + cuda.blockIdx.x
         # a warp covers 8x4 pixels: its threads meet the same billboards
         warp, lane = cuda.threadIdx.x // 32, cuda.threadIdx.x % 32
-        x = tile % across * TILE + warp % 2 * 8 + lane % 8
-        y = tile // across * TILE + warp // 2 * 4 + lane // 8
-        if x >= width or y >= height:
+        x = tile % shape.across * TILE + warp % 2 * 8 + lane % 8
+        y = tile // shape.across * TILE + warp // 2 * 4 + lane // 8
+        if x >= shape.width or y >= shape.height:
             return
-        pixels = np.int64(width) * height
-        pixel = np.int64(y) * width + x
-        zero, one, size, t_min = limits[0], limits[1], limits[2], limits[6]
-        at, allotted = np.int64(0), np.int64(0)
+        pixel, pixels = np.int64(y) * shape.width + x, np.int64(shape.width) * shape.height
+        zero, one, size, t_min = constants.zero, constants.one, constants.size, constants.t_min
+        members, record, box, rank = bins.members, bins.record, bins.box, bins.rank
+        first_taped, allotted = np.int64(0), np.int64(0)
         if replay:
-            allotted = np.int64(hits[pixel])
+            allotted = np.int64(images.hits[pixel])
             if allotted == 0:
                 return
-            at = ends[pixel] - allotted - base
-            if at + allotted > who.shape[0]:
-                status[0] = 1
+            first_taped = tape.ends[pixel] - allotted - tape.base
+            if first_taped + allotted > tape.primitives.shape[0]:
+                gradients.status[0] = 1
                 return
         for c in range(room):
             colour[c] = zero
-        through, number = one, 0
+        transmittance, number = one, 0
         resumed, again = False, True
-        cut_key, cut_place = zero, 0
+        cut_key, cut_rank = zero, 0
         while again:
             again = False
             begin, count = 0, 0
-            dropped, drop_key, drop_place = False, zero, 0
-            for j in range(start[tile], start[tile + 1]):
+            dropped, drop_key, drop_rank = False, zero, 0
+            for j in range(bins.start[tile], bins.start[tile + 1]):
                 i = members[j]
                 r = i * RECORD
-                reach = record[r + 11]
-                if dropped and reach < drop_key:
+                nearest_key = record[r + 11]
+                if dropped and nearest_key < drop_key:
                     break  # nothing that follows can be nearer than what is left for the next round
                 if x < box[i, 0] or x >= box[i, 2] or y < box[i, 1] or y >= box[i, 3]:
                     continue
                 dx, dy = real(x - (box[i, 0] + box[i, 2]) // 2), real(y - (box[i, 1] + box[i, 3]) // 2)
-                hit, s, t, _ = locate(record, r, dx, dy, limits)
+                hit, s, t, _ = intersect(record, r, dx, dy, constants)
                 if not (hit and s > -one and s < size and t > -one and t < size):
                     continue
-                column, row = first_texel(s, size, zero, one), first_texel(t, size, zero, one)
-                x0, x1 = weights(s, column, limits[3], zero, one)
-                y0, y1 = weights(t, row, limits[3], zero, one)
-                first, right, below = corners(i, column, row, limits[3], texels)
-                raw = sample(alpha, first, right, below, x0, x1, y0, y1)
-                if not raw >= limits[5]:
+                foot = footprint(s, t, constants)
+                first, right, below = corners(i, foot, constants.step, shape.texels)
+                raw = sample(textures.alpha, first, right, below, foot.x0, foot.x1, foot.y0, foot.y1)
+                if not raw >= constants.alpha_min:
                     continue
                 key = affine(record[r + 6], record[r + 7], record[r + 9], dx, dy)
-                own = place[i]
+                own_rank = rank[i]
                 if mode == RAY:
-                    if resumed and (key > cut_key or (key == cut_key and own < cut_place)):
+                    if resumed and (key > cut_key or (key == cut_key and own_rank < cut_rank)):
                         continue
-                    if dropped and (key < drop_key or (key == drop_key and own > drop_place)):
+                    if dropped and (key < drop_key or (key == drop_key and own_rank > drop_rank)):
                         continue
-                    while count > 0 and keys[begin] >= reach and through >= t_min:
-                        through = emit(begin, at_s, at_t, opacities, waiting, through, number, colour, features, limits,
-                                       texels, image, opacity, pixel, pixels, at, allotted, tape, who)  # fmt: skip
+                    while count > 0 and queue.key[begin] >= nearest_key and transmittance >= t_min:
+                        transmittance = blend(
+                            queue, begin, transmittance, number, colour, scene, pixel, first_taped, allotted
+                        )
                         number += 1
                         begin = (begin + 1) & mask
                         count -= 1
-                    if through < t_min:
+                    if transmittance < t_min:
                         break
                     if count == capacity:  # the farthest hit gives way, until the next round
                         last = (begin + count - 1) & mask
-                        last_place = place[waiting[last]]
+                        last_rank = rank[queue.billboard[last]]
                         dropped = True
-                        if key < keys[last] or (key == keys[last] and own > last_place):
-                            drop_key, drop_place = key, own
+                        if key < queue.key[last] or (key == queue.key[last] and own_rank > last_rank):
+                            drop_key, drop_rank = key, own_rank
                             continue
-                        drop_key, drop_place = keys[last], last_place
+                        drop_key, drop_rank = queue.key[last], last_rank
                         count -= 1
                 n = count
                 if mode != CENTER:
                     while n > 0:
                         other = (begin + n - 1) & mask
-                        if keys[other] > key or (keys[other] == key and place[waiting[other]] < own):
+                        nearer = queue.key[other] > key
+                        if nearer or (queue.key[other] == key and rank[queue.billboard[other]] < own_rank):
                             break
                         slot = (begin + n) & mask
-                        at_s[slot], at_t[slot] = at_s[other], at_t[other]
-                        keys[slot], opacities[slot] = keys[other], opacities[other]
-                        waiting[slot] = waiting[other]
+                        queue.s[slot], queue.t[slot] = queue.s[other], queue.t[other]
+                        queue.key[slot], queue.alpha[slot] = queue.key[other], queue.alpha[other]
+                        queue.billboard[slot] = queue.billboard[other]
                         n -= 1
                 slot = (begin + n) & mask
-                at_s[slot], at_t[slot] = s, t
-                keys[slot], opacities[slot] = key, record[r + 10] * raw
-                waiting[slot] = i
+                queue.s[slot], queue.t[slot] = s, t
+                queue.key[slot], queue.alpha[slot] = key, record[r + 10] * raw
+                queue.billboard[slot] = i
                 count += 1
-                if mode != RAY and count > queue:
-                    through = emit(begin, at_s, at_t, opacities, waiting, through, number, colour, features, limits,
-                                   texels, image, opacity, pixel, pixels, at, allotted, tape, who)  # fmt: skip
+                if mode != RAY and count > shape.queue:
+                    transmittance = blend(
+                        queue, begin, transmittance, number, colour, scene, pixel, first_taped, allotted
+                    )
                     number += 1
                     begin = (begin + 1) & mask
                     count -= 1
-                    if through < t_min:
+                    if transmittance < t_min:
                         break
-            while count > 0 and through >= t_min:
-                through = emit(begin, at_s, at_t, opacities, waiting, through, number, colour, features, limits, texels,
-                               image, opacity, pixel, pixels, at, allotted, tape, who)  # fmt: skip
+            while count > 0 and transmittance >= t_min:
+                transmittance = blend(queue, begin, transmittance, number, colour, scene, pixel, first_taped, allotted)
                 number += 1
                 begin = (begin + 1) & mask
                 count -= 1
-            if dropped and through >= t_min:
+            if dropped and transmittance >= t_min:
                 again, resumed = True, True
-                cut_key, cut_place = drop_key, drop_place
+                cut_key, cut_rank = drop_key, drop_rank
         if replay:
-            behind = zero
+            suffix = zero
             number = min(number, allotted)
             while number > 0:
                 number -= 1
-                spot = at + number
-                behind = spread(who[spot], tape[3 * spot], tape[3 * spot + 1], tape[3 * spot + 2], behind, x, y, record,
-                                box, features, alpha, limits, texels, image, pixel, pixels, grad_features, grad_alpha,
-                                sums)  # fmt: skip
+                suffix = scatter(first_taped + number, suffix, x, y, scene)
         else:
             for c in range(channels):
-                image[np.int64(c) * pixels + pixel] = colour[c]
-            opacity[pixel] = one - through
-            hits[pixel] = number
+                images.features[np.int64(c) * pixels + pixel] = colour[c]
+            images.opacity[pixel] = one - transmittance
+            images.hits[pixel] = number
 
     return kernel

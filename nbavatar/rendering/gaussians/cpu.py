@@ -6,6 +6,7 @@ threads.
 
 from dataclasses import fields
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,10 +22,11 @@ from nbavatar.rendering.gaussians.autograd import blend_scene
 from nbavatar.rendering.gaussians.patches import patches_of
 from nbavatar.rendering.gaussians.projection import FAINTEST, Projection, support_box
 from nbavatar.rendering.gaussians.reference import SplatSettings
+from nbavatar.rendering.scratch import array_of, scratch_bytes, scratch_type, scratch_views
 
 __all__ = ["blend_cpu", "count_samples"]
 
-_SCRATCH = 1 << 26  # bytes of notes a worker may use; fewer rows are worked on at once beyond it
+_TAPE = 1 << 26  # bytes that the tape of a worker may use; fewer rows are worked on at once beyond it
 
 
 def blend_cpu(
@@ -68,27 +70,27 @@ class _Scene:
         reach, box = support_box(projection, opacities.detach(), s.alpha_min)
         patches = patches_of(projection.form.detach(), opacities.detach(), reach, box)
         self.bins = binning.bin_billboards(patches, rank, 1, s.width, s.height, 1.0, torch.float64, by_nearest=False)
-        limits = [0, 1, max(s.alpha_min, FAINTEST), s.alpha_max, s.t_min]
-        self.limits = torch.tensor(limits, dtype=self.dtype).numpy()
+        self.real = np.dtype(np.float32 if self.dtype == torch.float32 else np.float64)
+        numbers = (0, 1, max(s.alpha_min, FAINTEST), s.alpha_max, s.t_min)
+        self.constants = cpu_kernels.Constants(*(self.real.type(number) for number in numbers))
 
     def forward(self) -> tuple[Tensor, Tensor]:
         s = self.settings
         image = torch.empty(3, s.height, s.width, dtype=self.dtype)
         alpha = torch.empty(s.height, s.width, dtype=self.dtype)
-        nothing = np.zeros((0, 0, 0), self.limits.dtype)
-        self._traverse(image.numpy(), alpha.numpy(), nothing, nothing.reshape(-1), replay=False)
+        nothing = np.zeros((0, 0, 0), self.real)
+        self._traverse(cpu_kernels.Images(image.numpy(), alpha.numpy()), nothing, nothing.reshape(-1))
         return image, alpha
 
     def backward(self, grad_image: Tensor, grad_alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gradients by form, opacities and colours."""
-        b = self.bins
         parts, _ = self.replay(torch.cat([grad_image, grad_alpha[None]]).to(self.dtype))
         grad_form = torch.empty(self.form.shape, dtype=torch.float64)
         grad_opacities = torch.empty(self.opacities.shape, dtype=self.dtype)
         grad_colours = torch.empty(self.colours.shape, dtype=self.dtype)
         cpu_kernels.gather_parts(
-            b.sequence, b.first, b.where, parts.reshape(-1, cpu_kernels.PARTS), self.form, self.opacities,
-            grad_form.numpy(), grad_opacities.numpy(), grad_colours.numpy(),
+            self.bins, parts.reshape(-1, cpu_kernels.PARTS), self.form, self.opacities, grad_form.numpy(),
+            grad_opacities.numpy(), grad_colours.numpy(),
         )  # fmt: skip
         return grad_form, grad_opacities, grad_colours
 
@@ -96,40 +98,34 @@ class _Scene:
         """Repeats the blending; what each tile adds to the gradients of its Gaussians, and the number of hits."""
         entries = len(self.bins.members)
         size = entries * cpu_kernels.PARTS
-        binning.require_memory(size * self.limits.itemsize, f"the gradients of {entries} entries in tiles")
+        binning.require_memory(size * self.real.itemsize, f"the gradients of {entries} entries in tiles")
         parts = torch.empty(size, dtype=self.dtype).numpy()
-        empty = np.zeros((0, 0, 0), self.limits.dtype)
-        hits = self._traverse(empty, empty.reshape(0, 0), grads.contiguous().numpy(), parts, replay=True)
+        empty = np.zeros((0, 0, 0), self.real)
+        hits = self._traverse(cpu_kernels.Images(empty, np.zeros((0, 0), self.real)), grads.contiguous().numpy(), parts)
         return parts, hits
 
-    def _traverse(
-        self, image: np.ndarray, alpha: np.ndarray, grads: np.ndarray, parts: np.ndarray, *, replay: bool
-    ) -> int:
-        s, b = self.settings, self.bins
+    def _traverse(self, images: cpu_kernels.Images, adjoints: np.ndarray, parts: np.ndarray) -> int:
+        """Runs the kernel on all threads, the replay if there are adjoints; returns the number of hits on the tape."""
+        s, b, replay = self.settings, self.bins, len(adjoints) != 0
         across = -(-s.width // binning.TILE_WIDTH)
-        lengths = np.diff(b.start)
+        lengths = np.diff(b.tile_start)
         tiles = np.argsort(-lengths, kind="stable").astype(np.int32)  # the longest first: no worker ends late
-        rows, chunks = binning.TILE_HEIGHT, 0
+        rows, longest = binning.TILE_HEIGHT, int(lengths.max(initial=0))
         if replay:
-            longest = int(lengths.max(initial=0))
-            row = longest * cpu_kernels.CHUNKS * (2 * LANES * self.limits.itemsize + 8)
-            rows = int(np.clip(_SCRATCH // max(1, row), 1, binning.TILE_HEIGHT))
-            chunks = longest * cpu_kernels.CHUNKS * rows
-        reals = 6 * (binning.TILE_WIDTH * rows + LANES) + 2 * LANES * chunks
-        binning.require_memory(
-            torch.get_num_threads() * (reals * self.limits.itemsize + 8 * chunks), f"notes of {chunks} rows of hits"
-        )
-        shape = np.array([s.width, s.height, across, rows, int(replay)], np.int64)
-        turn = np.zeros(1, np.int64)
+            row = longest * (binning.TILE_WIDTH // LANES) * (2 * LANES * self.real.itemsize + 8)
+            rows = int(np.clip(_TAPE // max(1, row), 1, binning.TILE_HEIGHT))
+        sizes = cpu_kernels.Sizes(rows, longest)
+        needed = scratch_bytes(cpu_kernels.BUFFERS, sizes, self.real, replay)
+        binning.require_memory(torch.get_num_threads() * needed, f"a tape of {sizes.packets} packets of hits")
+        shape = cpu_kernels.Shape(s.width, s.height, across, rows)
+        counter = np.zeros(1, np.int64)
 
         def work(_: int) -> int:
-            status = np.zeros(1, np.int64)
-            cpu_kernels.traverse(
-                turn, tiles, b.start, b.members, b.record.reshape(-1), b.box, self.colours.reshape(-1), self.limits,
-                shape, image, alpha, grads, parts, torch.empty(reals, dtype=self.dtype).numpy(),
-                torch.empty(2 * chunks, dtype=torch.int32).numpy(), status,
-            )  # fmt: skip
-            return int(status[0])
+            memory = torch.empty(needed, dtype=torch.uint8).numpy()
+            scratch = scratch_views(cpu_kernels.Scratch, cpu_kernels.BUFFERS, sizes, self.real, replay, memory)
+            return cpu_kernels.traverse(
+                counter, tiles, b, self.colours.reshape(-1), self.constants, shape, images, adjoints, parts, scratch
+            )
 
         return sum(run_workers(work))
 
@@ -139,21 +135,24 @@ def _prepare(dtype: torch.dtype) -> None:
     """Has every kernel compiled for a dtype."""
     real = types.float32 if dtype == torch.float32 else types.float64
 
-    def array(kind, dimensions: int = 1):
-        return types.Array(kind, dimensions, "C")
-
     i32, i64, f64 = types.int32, types.int64, types.float64
+
+    def group(kind: type, *members: Any) -> Any:
+        return types.BaseTuple.from_types(members, kind)
+
+    bins, shape = binning.bins_type(f64), group(cpu_kernels.Shape, *[i64] * len(cpu_kernels.Shape._fields))
+    constants = group(cpu_kernels.Constants, *[real] * len(cpu_kernels.Constants._fields))
     prepare(
         f"gaussians-{real}",
         {
             cpu_kernels.traverse: (
-                array(i64), array(i32), array(i64), array(i32), array(f64), array(i32, 2), array(real), array(real),
-                array(i64), array(real, 3), array(real, 2), array(real, 3), array(real), array(real), array(i32),
-                array(i64),
+                array_of(i64), array_of(i32), bins, array_of(real), constants, shape,
+                group(cpu_kernels.Images, array_of(real, 3), array_of(real, 2)), array_of(real, 3), array_of(real),
+                scratch_type(cpu_kernels.Scratch, cpu_kernels.BUFFERS, real),
             ),
             cpu_kernels.gather_parts: (
-                array(i32), array(i64), array(i64), array(real, 2), array(f64, 2), array(real), array(f64, 2),
-                array(real), array(real, 2),
+                bins, array_of(real, 2), array_of(f64, 2), array_of(real), array_of(f64, 2), array_of(real),
+                array_of(real, 2),
             ),
         },
     )  # fmt: skip

@@ -4,13 +4,11 @@ What the billboards' backend says of streams, of waits and of the order of sums 
 dtype of the colours: in float32, u of a long thin Gaussian is off by up to 6e-8 of its reach in pixels over its width.
 """
 
-from typing import Any
-
-import numpy as np
 import torch
 from torch import Tensor
 
 from nbavatar.rendering.billboards import cuda as raster_cuda
+from nbavatar.rendering.billboards.cuda_arguments import Images, Shape, Tape
 from nbavatar.rendering.billboards.cuda_kernels import CENTER
 from nbavatar.rendering.billboards.reference import BlendSettings
 from nbavatar.rendering.gaussians import cuda_kernels
@@ -50,25 +48,26 @@ class _Scene(raster_cuda._Scene):
         super().__init__(patches, rank, texture.new_zeros(len(texture), 1, 1, 0), texture, flat)
         assert self.mode == CENTER or self.count == 0
         self.form, self.opacities, self.colours = projection.form.detach(), opacities.detach(), colours.detach()
-        limits = (0, 1, -0.5, max(s.alpha_min, FAINTEST), s.alpha_max, s.t_min)
-        self.limits = tuple(self.real(value) for value in limits)
+        numbers = (0, 1, -0.5, max(s.alpha_min, FAINTEST), s.alpha_max, s.t_min)
+        self.numbers = cuda_kernels.Constants(*(self.real(number) for number in numbers))
 
-    def _blend(self, replay: bool, first: int, tiles: int, image: Tensor, alpha: Tensor, *rest: Any) -> None:
+    def _blend(self, replay: bool, first: int, tiles: int, images: Images, tape: Tape, sums: Tensor) -> None:
         s = self.settings
-        kernel = cuda_kernels.traverse(np.float64 if self.double else np.float32, replay)
+        kernel = cuda_kernels.traverse(self.real, replay)
+        shape = Shape(1, s.width, s.height, self.across, s.queue)
+        flat = Images(*(tensor.reshape(-1) for tensor in images))
         with self._launcher() as launch:
-            launch(kernel, tiles, cuda_kernels.THREADS, first, self.start, self.members, self.record, self.box,
-                   self.colours.reshape(-1), self.limits, s.width, s.height, self.across, image.reshape(-1),
-                   alpha.reshape(-1), self.hits, *rest, self.status)  # fmt: skip
+            launch(kernel, tiles, cuda_kernels.THREADS, first, self.bins, self.colours.reshape(-1), self.numbers,
+                   shape, flat, tape, sums, self.status)  # fmt: skip
 
     def forward(self) -> tuple[Tensor, Tensor]:
         s = self.settings
         image, alpha = self._zeros(3, s.height, s.width), self._zeros(s.height, s.width)
         self.hits = self._zeros(s.height * s.width, dtype=torch.int32)
         if self.count:
-            whole, sums = self._zeros(1, dtype=torch.int32), self._zeros(1, dtype=torch.float64)
-            self._blend(False, 0, self.across * self.down, image, alpha, self._zeros(1, dtype=torch.int64), 0,
-                        self._zeros(1), whole, sums)  # fmt: skip
+            i32, sums = self._zeros(1, dtype=torch.int32), self._zeros(1, dtype=torch.float64)
+            tape = Tape(self._zeros(1, dtype=torch.int64), 0, self._zeros(1), i32)
+            self._blend(False, 0, self.across * self.down, Images(image, alpha, self.hits), tape, sums)
         return image, alpha
 
     def backward(self, grad_image: Tensor, grad_alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -76,17 +75,18 @@ class _Scene(raster_cuda._Scene):
         sums = self._zeros(self.count * cuda_kernels.SUMS, dtype=torch.float64)
         if self.count:
             ends = self.hits.cumsum(0, dtype=torch.int64)
-            grads = [grad.to(self.dtype).contiguous() for grad in (grad_image, grad_alpha)]
+            adjoints = Images(*(grad.to(self.dtype).contiguous() for grad in (grad_image, grad_alpha)), self.hits)
             groups = self._groups(ends)
             largest = max(1, *(hits for _, _, _, hits in groups))
             self._require_memory(largest * (8 * (1 + self.double) + 4), f"{largest} hits in the backward pass")
-            tape, who = self._zeros(2 * largest), self._zeros(largest, dtype=torch.int32)
+            values, primitives = self._zeros(2 * largest), self._zeros(largest, dtype=torch.int32)
             for first, rows, base, _ in groups:
-                self._blend(True, first * self.across, rows * self.across, *grads, ends, base, tape, who, sums)
-        hu, hv, huu, huv, hvv, h, *by_colour = sums.reshape(-1, cuda_kernels.SUMS).unbind(-1)
+                tape = Tape(ends, base, values, primitives)
+                self._blend(True, first * self.across, rows * self.across, adjoints, tape, sums)
+        hu, hv, huu, huv, hvv, h, *dL_dcolour = sums.reshape(-1, cuda_kernels.SUMS).unbind(-1)
         # dL/du = -h u and dL/dv = -h v; the offsets from the mean are dy = v / k and dx = (u - s dy) / p
         p, s, k = self.form[:, 0], self.form[:, 1], self.form[:, 2]
-        by_form = torch.stack([-(huu - s / k * huv) / p, -huv / k, -hvv / k, p * hu, s * hu + k * hv], -1)
+        dL_dform = torch.stack([-(huu - s / k * huv) / p, -huv / k, -hvv / k, p * hu, s * hu + k * hv], -1)
         opacities = self.opacities.double()
-        by_opacities = torch.where(opacities > 0, h / torch.where(opacities > 0, opacities, 1.0), 0.0)
-        return by_form, by_opacities.to(self.dtype), torch.stack(by_colour, -1).to(self.dtype)
+        dL_dopacities = torch.where(opacities > 0, h / torch.where(opacities > 0, opacities, 1.0), 0.0)
+        return dL_dform, dL_dopacities.to(self.dtype), torch.stack(dL_dcolour, -1).to(self.dtype)

@@ -1,7 +1,7 @@
 """Numba-CUDA kernel of the Gaussian rasterizer: one thread a pixel, one block a tile.
 
-The records and lists are those that the billboards' kernels make (`raster.cuda_binning`). The backward pass
-repeats the forward one, notes its hits on a tape and walks them from back to front, which needs no division by
+The records and lists are those that the billboards' kernels make (`rendering.cuda_binning`). The replay
+repeats the forward pass, records its hits on a tape and walks them from back to front, which needs no division by
 a transmittance. It sums gradients by atomic additions, whose order is not fixed: results differ from run to run
 by rounding.
 """
@@ -11,17 +11,28 @@ by rounding.
 
 import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba import cuda
 
 from nbavatar.rendering.binning import RECORD
 from nbavatar.rendering.cuda_binning import TILE
 
-__all__ = ["SUMS", "THREADS", "traverse"]
+__all__ = ["SUMS", "THREADS", "Constants", "traverse"]
 
 THREADS = TILE * TILE
 SUMS = 9  # numbers summed for a Gaussian: h u, h v, h u^2, h u v, h v^2, h and three colours
+
+
+class Constants(NamedTuple):
+    """Numbers that steer the kernels, of the type of all arithmetic."""
+
+    zero: Any
+    one: Any
+    minus_half: Any
+    alpha_min: Any
+    alpha_max: Any
+    t_min: Any
 
 
 @lru_cache(maxsize=4)
@@ -33,16 +44,13 @@ def traverse(real: Any, replay: bool) -> Any:
         replay: which of the two.
 
     Returns:
-        Kernel for THREADS threads a block and a block a tile, with arguments `first_tile`; `start` (tiles + 1,),
-        `members` (E,) the tiles' lists; `record`, `box` (N,); `colours` (3 N,); `limits`: zero, one, -1/2,
-        alpha_min, alpha_max, t_min; `width`, `height`, `across` (tiles); `image` (3 H W,), `alpha` (H W,), `hits`
-        (H W,) int32: results, or in the replay the gradients by the first two and what was counted; and for the
-        replay `ends` (H W,) int64, running number of hits, `base` those before the tape begins, `tape` (2 hits,),
-        `who` (hits,) int32, `sums` (SUMS N,) float64, `status` (1,), set where the tape is too short.
+        Kernel for THREADS threads a block and a block a tile, with arguments `first_tile`; `bins`, `shape`, `images`
+        and `tape` of the billboards' kernels (`cuda_arguments`); `colours` (3 N,); `constants`; and for the replay
+        `sums` (SUMS N,) float64 and `status` (1,), set where the tape is too short.
     """
 
     @cuda.jit(device=True)
-    def place(record, box, i, x, y):
+    def coordinates(record, box, i, x, y):
         """Coordinates u and v of a pixel in Gaussian i."""
         r = i * RECORD
         dx = real(x - (box[i, 0] + box[i, 2]) // 2)
@@ -51,75 +59,76 @@ def traverse(real: Any, replay: bool) -> Any:
         return u, record[r + 4] * dy + record[r + 5]
 
     @cuda.jit
-    def kernel(first_tile, start, members, record, box, colours, limits, width, height, across, image, alpha, hits,
-               ends, base, tape, who, sums, status):  # fmt: skip
-        zero, one, minus_half, alpha_min, alpha_max, t_min = limits
+    def kernel(first_tile, bins, colours, constants, shape, images, tape, sums, status):
+        zero, one, alpha_max = constants.zero, constants.one, constants.alpha_max
+        start, members, record, box = bins.start, bins.members, bins.record, bins.box
+        image, alpha, hits = images.features, images.opacity, images.hits
         tile = first_tile + cuda.blockIdx.x
-        x = tile % across * TILE + cuda.threadIdx.x % TILE
-        y = tile // across * TILE + cuda.threadIdx.x // TILE
-        if x >= width or y >= height:
+        x = tile % shape.across * TILE + cuda.threadIdx.x % TILE
+        y = tile // shape.across * TILE + cuda.threadIdx.x // TILE
+        if x >= shape.width or y >= shape.height:
             return
-        pixel = y * width + x
-        area = width * height
-        begin = ends[pixel] - hits[pixel] - base if replay else 0
-        through, red, green, blue = one, zero, zero, zero
+        pixel = y * shape.width + x
+        area = shape.width * shape.height
+        begin = tape.ends[pixel] - hits[pixel] - tape.base if replay else 0
+        transmittance, red, green, blue = one, zero, zero, zero
         count = 0
         for entry in range(start[tile], start[tile + 1]):
             i = members[entry]
             if x < box[i, 0] or x >= box[i, 2] or y < box[i, 1] or y >= box[i, 3]:
                 continue
-            u, v = place(record, box, i, x, y)
-            raw = record[i * RECORD + 10] * math.exp(minus_half * (u * u + v * v))
-            if not raw >= alpha_min:
+            u, v = coordinates(record, box, i, x, y)
+            raw = record[i * RECORD + 10] * math.exp(constants.minus_half * (u * u + v * v))
+            if not raw >= constants.alpha_min:
                 continue
             a = min(raw, alpha_max)
-            after = through * (one - a)
-            if after < t_min:
+            after = transmittance * (one - a)
+            if after < constants.t_min:
                 break
             if replay:
-                spot = begin + count
-                if spot >= who.shape[0]:
+                at = begin + count
+                if at >= tape.primitives.shape[0]:
                     status[0] = 1
                     break
-                tape[2 * spot] = through
-                tape[2 * spot + 1] = raw
-                who[spot] = i
+                tape.values[2 * at] = transmittance
+                tape.values[2 * at + 1] = raw
+                tape.primitives[at] = i
             else:
-                w = through * a
-                red += w * colours[3 * i]
-                green += w * colours[3 * i + 1]
-                blue += w * colours[3 * i + 2]
+                weight = transmittance * a
+                red += weight * colours[3 * i]
+                green += weight * colours[3 * i + 1]
+                blue += weight * colours[3 * i + 2]
             count += 1
-            through = after
+            transmittance = after
         if not replay:
             image[pixel], image[area + pixel], image[2 * area + pixel] = red, green, blue
-            alpha[pixel] = one - through
+            alpha[pixel] = one - transmittance
             hits[pixel] = count
             return
-        by_r, by_g, by_b, by_a = image[pixel], image[area + pixel], image[2 * area + pixel], alpha[pixel]
-        behind = zero
+        dL_dr, dL_dg, dL_db, dL_dopacity = image[pixel], image[area + pixel], image[2 * area + pixel], alpha[pixel]
+        suffix = zero
         while count > 0:
             count -= 1
-            spot = begin + count
-            i = who[spot]
-            through, raw = tape[2 * spot], tape[2 * spot + 1]
+            at = begin + count
+            i = tape.primitives[at]
+            transmittance, raw = tape.values[2 * at], tape.values[2 * at + 1]
             a = min(raw, alpha_max)
-            worth = colours[3 * i] * by_r + colours[3 * i + 1] * by_g + colours[3 * i + 2] * by_b + by_a
-            gain = worth - behind
-            behind += a * gain
-            w = through * a
-            at = SUMS * i
-            cuda.atomic.add(sums, at + 6, w * by_r)
-            cuda.atomic.add(sums, at + 7, w * by_g)
-            cuda.atomic.add(sums, at + 8, w * by_b)
+            dL_dweight = colours[3 * i] * dL_dr + colours[3 * i + 1] * dL_dg + colours[3 * i + 2] * dL_db + dL_dopacity
+            gain = dL_dweight - suffix
+            suffix += a * gain
+            weight = transmittance * a
+            place = SUMS * i
+            cuda.atomic.add(sums, place + 6, weight * dL_dr)
+            cuda.atomic.add(sums, place + 7, weight * dL_dg)
+            cuda.atomic.add(sums, place + 8, weight * dL_db)
             if raw <= alpha_max:  # a capped alpha does not move
-                u, v = place(record, box, i, x, y)
-                h = through * gain * raw
-                cuda.atomic.add(sums, at, h * u)
-                cuda.atomic.add(sums, at + 1, h * v)
-                cuda.atomic.add(sums, at + 2, h * u * u)
-                cuda.atomic.add(sums, at + 3, h * u * v)
-                cuda.atomic.add(sums, at + 4, h * v * v)
-                cuda.atomic.add(sums, at + 5, h)
+                u, v = coordinates(record, box, i, x, y)
+                h = transmittance * gain * raw
+                cuda.atomic.add(sums, place, h * u)
+                cuda.atomic.add(sums, place + 1, h * v)
+                cuda.atomic.add(sums, place + 2, h * u * u)
+                cuda.atomic.add(sums, place + 3, h * u * v)
+                cuda.atomic.add(sums, place + 4, h * v * v)
+                cuda.atomic.add(sums, place + 5, h)
 
     return kernel

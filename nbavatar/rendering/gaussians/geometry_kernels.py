@@ -106,7 +106,7 @@ def project(means, quats, scales, offsets, camera, form, variances, depth, visib
 
 
 @kernel
-def project_back(means, quats, scales, form, visible, camera, grad, by_means, by_quats, by_scales):
+def project_back(means, quats, scales, form, visible, camera, grad, dL_dmeans, dL_dquats, dL_dscales):
     """Gradients of `project` by means, quaternions and scales, from those by `form` (N, 5).
 
     With Sigma' = [[a, b], [b, c]] and det = a c - b^2, d p = p / 2 (dc / c - d det / det),
@@ -117,10 +117,10 @@ def project_back(means, quats, scales, form, visible, camera, grad, by_means, by
     axes, moved, rows, turned = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((2, 3)), np.zeros((3, 3))
     for i in range(len(means)):
         for j in range(3):
-            by_means[i, j] = 0.0
-            by_scales[i, j] = 0.0
+            dL_dmeans[i, j] = 0.0
+            dL_dscales[i, j] = 0.0
         for j in range(4):
-            by_quats[i, j] = 0.0
+            dL_dquats[i, j] = 0.0
         if not visible[i]:
             continue
         x, y, z = _turn(camera, means[i, 0], means[i, 1], means[i, 2])
@@ -139,53 +139,53 @@ def project_back(means, quats, scales, form, visible, camera, grad, by_means, by
             c += rows[1, j] * rows[1, j]
         p, k_ = form[i, 0], form[i, 2]
         det = c / (p * p)
-        g_p = grad[i, 0] - b / c * grad[i, 1]
-        g_det = -0.5 * g_p * p / det
-        g_a = c * g_det
-        g_b = -grad[i, 1] * p / c - 2.0 * b * g_det
-        g_c = g_det * (b * b / c) + grad[i, 1] * p * b / (c * c) - 0.5 * grad[i, 2] * k_ / c
-        g_z, g_side_x, g_side_y = 0.0, 0.0, 0.0
+        dL_dp = grad[i, 0] - b / c * grad[i, 1]
+        dL_ddet = -0.5 * dL_dp * p / det
+        dL_da = c * dL_ddet
+        dL_db = -grad[i, 1] * p / c - 2.0 * b * dL_ddet
+        dL_dc = dL_ddet * (b * b / c) + grad[i, 1] * p * b / (c * c) - 0.5 * grad[i, 2] * k_ / c
+        dL_dz, dL_dside_x, dL_dside_y = 0.0, 0.0, 0.0
         for j in range(3):
-            g_x = 2.0 * g_a * rows[0, j] + g_b * rows[1, j]
-            g_y = 2.0 * g_c * rows[1, j] + g_b * rows[0, j]
-            g_z -= g_x * rows[0, j] + g_y * rows[1, j]
-            g_side_x -= g_x * moved[j, 2] / z
-            g_side_y -= g_y * moved[j, 2] / z
-            u = fx * g_x / z
-            v = (skew * g_x + fy * g_y) / z
-            w = -(side_x * g_x + side_y * g_y) / z
-            by_scales[i, j] = axes[j, 0] * u + axes[j, 1] * v + axes[j, 2] * w
+            dL_dx = 2.0 * dL_da * rows[0, j] + dL_db * rows[1, j]
+            dL_dy = 2.0 * dL_dc * rows[1, j] + dL_db * rows[0, j]
+            dL_dz -= dL_dx * rows[0, j] + dL_dy * rows[1, j]
+            dL_dside_x -= dL_dx * moved[j, 2] / z
+            dL_dside_y -= dL_dy * moved[j, 2] / z
+            u = fx * dL_dx / z
+            v = (skew * dL_dx + fy * dL_dy) / z
+            w = -(side_x * dL_dx + side_y * dL_dy) / z
+            dL_dscales[i, j] = axes[j, 0] * u + axes[j, 1] * v + axes[j, 2] * w
             turned[0, j], turned[1, j], turned[2, j] = _turn_back(
                 camera, scales[i, j] * u, scales[i, j] * v, scales[i, j] * w
             )
-        by_tx, by_ty = fx * grad[i, 3], skew * grad[i, 3] + fy * grad[i, 4]
-        by_clamped = fy * g_side_y
+        dL_dtx, dL_dty = fx * grad[i, 3], skew * grad[i, 3] + fy * grad[i, 4]
+        dL_dclamped = fy * dL_dside_y
         if free_x:
-            by_tx += fx * g_side_x
-            by_clamped += skew * g_side_x
+            dL_dtx += fx * dL_dside_x
+            dL_dclamped += skew * dL_dside_x
         if free_y:
-            by_ty += by_clamped
-        g_z = (g_z - (by_tx * x + by_ty * y) / z) / z
-        by_means[i, 0], by_means[i, 1], by_means[i, 2] = _turn_back(camera, by_tx / z, by_ty / z, g_z)
-        _quaternion_back(quats, i, turned, by_quats)
+            dL_dty += dL_dclamped
+        dL_dz = (dL_dz - (dL_dtx * x + dL_dty * y) / z) / z
+        dL_dmeans[i, 0], dL_dmeans[i, 1], dL_dmeans[i, 2] = _turn_back(camera, dL_dtx / z, dL_dty / z, dL_dz)
+        _quaternion_back(quats, i, turned, dL_dquats)
 
 
 @inlined
-def _quaternion_back(quats, i, by_matrix, by_quats):
+def _quaternion_back(quats, i, dL_dmatrix, dL_dquats):
     """Gradient by a quaternion of any norm, from that by its rotation matrix."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
-    m = by_matrix
+    m = dL_dmatrix
     s = 2.0 / (w * w + x * x + y * y + z * z)
-    by_s = m[1, 0] * (x * y + w * z) + m[0, 1] * (x * y - w * z) - m[0, 0] * (y * y + z * z)
-    by_s += m[2, 0] * (x * z - w * y) + m[0, 2] * (x * z + w * y) - m[1, 1] * (x * x + z * z)
-    by_s += m[2, 1] * (y * z + w * x) + m[1, 2] * (y * z - w * x) - m[2, 2] * (x * x + y * y)
+    dL_ds = m[1, 0] * (x * y + w * z) + m[0, 1] * (x * y - w * z) - m[0, 0] * (y * y + z * z)
+    dL_ds += m[2, 0] * (x * z - w * y) + m[0, 2] * (x * z + w * y) - m[1, 1] * (x * x + z * z)
+    dL_ds += m[2, 1] * (y * z + w * x) + m[1, 2] * (y * z - w * x) - m[2, 2] * (x * x + y * y)
     xy, xz, yz = m[1, 0] + m[0, 1], m[2, 0] + m[0, 2], m[2, 1] + m[1, 2]
     wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    t = s * by_s  # the norm's share: ds / dq = -s^2 q
-    by_quats[i, 0] = s * (x * wx + y * wy + z * wz - t * w)
-    by_quats[i, 1] = s * (y * xy + z * xz + w * wx - 2.0 * x * (m[1, 1] + m[2, 2]) - t * x)
-    by_quats[i, 2] = s * (x * xy + z * yz + w * wy - 2.0 * y * (m[0, 0] + m[2, 2]) - t * y)
-    by_quats[i, 3] = s * (x * xz + y * yz + w * wz - 2.0 * z * (m[0, 0] + m[1, 1]) - t * z)
+    t = s * dL_ds  # the norm's share: ds / dq = -s^2 q
+    dL_dquats[i, 0] = s * (x * wx + y * wy + z * wz - t * w)
+    dL_dquats[i, 1] = s * (y * xy + z * xz + w * wx - 2.0 * x * (m[1, 1] + m[2, 2]) - t * x)
+    dL_dquats[i, 2] = s * (x * xy + z * yz + w * wy - 2.0 * y * (m[0, 0] + m[2, 2]) - t * y)
+    dL_dquats[i, 3] = s * (x * xz + y * yz + w * wz - 2.0 * z * (m[0, 0] + m[1, 1]) - t * z)
 
 
 @inlined
@@ -231,23 +231,23 @@ def shade(coefficients, offsets, count, colours):
 
 
 @kernel
-def shade_back(coefficients, offsets, count, colours, grad, by_coefficients, by_offsets):
+def shade_back(coefficients, offsets, count, colours, grad, dL_dcoefficients, dL_doffsets):
     """Gradients of `shade` by coefficients and offsets, from those by the colours."""
     values, g = np.zeros(16), np.zeros(16)
     for i in range(len(offsets)):
         x, y, z, length = _unit(offsets, i)
         _fill_basis(values, count, x, y, z)
-        by_r = grad[i, 0] if colours[i, 0] > 0.0 else 0.0
-        by_g = grad[i, 1] if colours[i, 1] > 0.0 else 0.0
-        by_b = grad[i, 2] if colours[i, 2] > 0.0 else 0.0
+        dL_dr = grad[i, 0] if colours[i, 0] > 0.0 else 0.0
+        dL_dg = grad[i, 1] if colours[i, 1] > 0.0 else 0.0
+        dL_db = grad[i, 2] if colours[i, 2] > 0.0 else 0.0
         for k in range(count):
-            g[k] = by_r * coefficients[i, k, 0] + by_g * coefficients[i, k, 1] + by_b * coefficients[i, k, 2]
-            by_coefficients[i, k, 0] = values[k] * by_r
-            by_coefficients[i, k, 1] = values[k] * by_g
-            by_coefficients[i, k, 2] = values[k] * by_b
+            g[k] = dL_dr * coefficients[i, k, 0] + dL_dg * coefficients[i, k, 1] + dL_db * coefficients[i, k, 2]
+            dL_dcoefficients[i, k, 0] = values[k] * dL_dr
+            dL_dcoefficients[i, k, 1] = values[k] * dL_dg
+            dL_dcoefficients[i, k, 2] = values[k] * dL_db
         for k in range(count, coefficients.shape[1]):
             for j in range(3):
-                by_coefficients[i, k, j] = 0.0
+                dL_dcoefficients[i, k, j] = 0.0
         dx, dy, dz = 0.0, 0.0, 0.0
         if count > 1:
             dx, dy, dz = -L1 * g[3], -L1 * g[1], L1 * g[2]
@@ -264,6 +264,6 @@ def shade_back(coefficients, offsets, count, colours, grad, by_coefficients, by_
             dz += _L31 * x * y * g[10] - 10.0 * _L32 * z * (y * g[11] + x * g[13])
             dz += _L33 * (15.0 * z * z - 3.0) * g[12] + _L34 * (x * x - y * y) * g[14]
         along = x * dx + y * dy + z * dz
-        by_offsets[i, 0] = (dx - along * x) / length
-        by_offsets[i, 1] = (dy - along * y) / length
-        by_offsets[i, 2] = (dz - along * z) / length
+        dL_doffsets[i, 0] = (dx - along * x) / length
+        dL_doffsets[i, 1] = (dy - along * y) / length
+        dL_doffsets[i, 2] = (dz - along * z) / length

@@ -12,7 +12,7 @@ def patches_of(form: Tensor, opacities: Tensor, reach: Tensor, box: Tensor) -> P
     """The patches |u|, |v| <= reach, which enclose where Gaussians are seen.
 
     Their "inverse depth" is `reach` everywhere, so a patch of one texel ends where its texture coordinates are 1.
-    A record (`raster.binning.pack`) then holds u (0-2), v (3-5), reach (8) and opacity (10).
+    A record (`rendering.binning.pack`) then holds u (0-2), v (3-5), reach (8) and opacity (10).
 
     Args:
         form: (N, 5) float64, see `nbavatar.rendering.gaussians.projection.Projection`.

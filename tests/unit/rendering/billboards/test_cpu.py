@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from nbavatar.errors import DataError, DeviceError
 from nbavatar.rendering import binning
-from nbavatar.rendering.billboards import cpu, cpu_pixels, render_billboards
+from nbavatar.rendering.billboards import cpu, cpu_blend, render_billboards
 from nbavatar.rendering.billboards.projection import project_billboards, texture_support
 from nbavatar.rendering.billboards.reference import BlendSettings, blend_reference, critical_pixels
 from nbavatar.rendering.ordering import canonical_rank, parse_order
@@ -178,7 +178,7 @@ def test_a_picture_written_past_the_caches_is_the_same():
     """Widths that are and are not multiples of sixteen pixels take different ways to memory."""
     scene = random_billboards(24, 60, 4, 8)
     view, K = camera(1024, 512, focal=500.0)
-    assert 1024 * 512 * 8 >= cpu_pixels.LARGE
+    assert 1024 * 512 * 8 >= cpu_blend.LARGE
     image, opacity = render_billboards(*scene, view, K, 1024, 512)
     other, other_opacity = render_billboards(*scene, view, K, 1021, 512)
     assert float(opacity.max()) > 0.9
@@ -192,7 +192,7 @@ def test_a_replay_that_finds_other_hits_is_refused(monkeypatch):
 
     def short(scene):
         result = forward(scene)
-        scene.made[scene.made.argmax()] -= 1
+        scene.bundles[scene.bundles.argmax()] -= 1
         return result
 
     monkeypatch.setattr(cpu._Scene, "forward", short)
@@ -253,7 +253,7 @@ def test_hits_noted_in_several_groups_give_the_same_gradients(monkeypatch):
         return torch.autograd.grad(image.sum() + opacity.square().sum(), scene)
 
     whole = gradients()
-    monkeypatch.setattr(cpu, "_NOTES", 500)
+    monkeypatch.setattr(cpu, "_TAPE", 500)
     for a, b in zip(whole, gradients(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
 

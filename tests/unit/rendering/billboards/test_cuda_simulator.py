@@ -186,14 +186,14 @@ def case_tape_in_groups(device):
     scene = [tensor.to(device).requires_grad_() for tensor in random_billboards(18, 8, 3, 2)]
     view, K = (tensor.to(device) for tensor in small_camera(9, 40))
     grads = []
-    notes = cuda._NOTES
+    tape = cuda._TAPE
     try:
-        for limit in (notes, 1):
-            cuda._NOTES = limit
+        for limit in (tape, 1):
+            cuda._TAPE = limit
             image, opacity = render_billboards(*scene, view, K, 9, 40, backend="cuda")
             grads.append(torch.autograd.grad(image.sum() + opacity.square().sum(), scene))
     finally:
-        cuda._NOTES = notes
+        cuda._TAPE = tape
     for got, want in zip(*grads, strict=True):
         assert bool(want.any())
         torch.testing.assert_close(got, want, rtol=1e-10, atol=1e-12)

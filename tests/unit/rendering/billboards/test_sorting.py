@@ -4,7 +4,8 @@ import numba
 import numpy as np
 import pytest
 
-from nbavatar.jit.lanes import LANES, bits, load, spread
+from nbavatar.jit.lane_memory import load
+from nbavatar.jit.lanes import LANES, broadcast, mask_bits
 from nbavatar.jit.memory import pointer
 from nbavatar.rendering.sorting import LONGEST, comparisons, network
 
@@ -16,7 +17,7 @@ _sort = network(LONGEST)
 def _sort_queues(keys, opacities, ids, held, plane, none):
     """Sorts the queues of the first eight pixels; returns the mask of those with a tie."""
     held = load(pointer(held, 0), 0)
-    return bits(_sort(pointer(keys, 0), pointer(opacities, 0), pointer(ids, 0), 0, plane, held, spread(none)))
+    return mask_bits(_sort(pointer(keys, 0), pointer(opacities, 0), pointer(ids, 0), 0, plane, held, broadcast(none)))
 
 
 @pytest.mark.parametrize("count", range(LONGEST + 1))

@@ -158,7 +158,7 @@ def test_thousands_of_layers():
     assert float(alpha.max()) > 0.99
 
 
-def test_layers_noted_in_several_bands_give_the_same_gradients(monkeypatch):
+def test_layers_taped_in_several_bands_give_the_same_gradients(monkeypatch):
     scene = [tensor.requires_grad_() for tensor in random_gaussians(18, 100, None)]
     view, K = camera(100, 70, focal=60.0)
 
@@ -167,7 +167,7 @@ def test_layers_noted_in_several_bands_give_the_same_gradients(monkeypatch):
         return torch.autograd.grad(image.sum() + alpha.square().sum(), scene)
 
     whole = gradients()
-    monkeypatch.setattr(cpu, "_SCRATCH", 1 << 15)
+    monkeypatch.setattr(cpu, "_TAPE", 1 << 15)
     for a, b in zip(whole, gradients(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
 

@@ -96,13 +96,13 @@ def case_hits_noted_in_groups(device):
         image, alpha, _ = render_gaussians(*scene, view, K, WIDTH, 35, backend="cuda")
         return torch.autograd.grad(image.sum() + alpha.square().sum(), scene)
 
-    whole, limit = gradients(), cuda._NOTES
+    whole, limit = gradients(), cuda._TAPE
     try:
-        cuda._NOTES = 200
+        cuda._TAPE = 200
         for a, b in zip(whole, gradients(), strict=True):
             torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
     finally:
-        cuda._NOTES = limit
+        cuda._TAPE = limit
 
 
 CASES = {name.removeprefix("case_"): case for name, case in list(globals().items()) if name.startswith("case_")}
