@@ -91,13 +91,15 @@ def _joined(digests: Iterable[str]) -> str:
     return hashlib.sha256("\n".join(digests).encode()).hexdigest()[:12]
 
 
+@functools.cache
 def _folder(*parts: str, frames: frozenset[str] | None = None) -> str:
     """Digest of the files of a folder, or of those that are named after one of these frames."""
-    total = hashlib.sha256()
-    for name, facts in _listing(os.path.join(*parts)):
-        if frames is None or os.path.splitext(name)[0] in frames:
-            total.update(f"{name}\0{facts}\0".encode(errors="surrogateescape"))
-    return total.hexdigest()
+    text = "".join(
+        f"{name}\0{facts}\0"
+        for name, facts in _listing(os.path.join(*parts))
+        if frames is None or os.path.splitext(name)[0] in frames
+    )
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()
 
 
 @functools.cache

@@ -20,8 +20,8 @@ def root(tmp_path):
 
 
 def _digest(root, kinds=("images", "masks")):
-    files_digest.__globals__["_listing"].cache_clear()  # a plan asks once for each folder
-    files_digest.__globals__["_frames"].cache_clear()
+    for kept in ("_listing", "_folder", "_frames"):  # a plan asks once for each folder
+        files_digest.__globals__[kept].cache_clear()
     return files_digest(str(root), "c", kinds)
 
 
