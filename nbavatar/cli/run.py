@@ -17,6 +17,8 @@ import argparse
 import importlib.util
 import json
 import os
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -86,9 +88,20 @@ def main(args: argparse.Namespace) -> int:
     if code == 0 and report.is_file() and not args.snakemake:
         if args.what == "smoke":
             for table in sorted((here / "results" / "smoke" / "tables").glob("*.md")):
-                print(table.read_text(encoding="utf-8"))
+                lines = table.read_text(encoding="utf-8").splitlines()
+                print("\n".join(line for line in lines if not line.startswith("<!--")))  # records, for programs
+        print(f"viewer: {_own_command()} view results/{args.what}")
         print(f"report: {report.relative_to(here)}")
     return code
+
+
+def _own_command() -> str:
+    """How to call `nbavatar` from here: by its name where the shell finds this one, else by its path."""
+    own = Path(sys.executable).parent / "nbavatar"
+    found = shutil.which("nbavatar")
+    if not own.is_file() or (found and os.path.samefile(found, own)):
+        return "nbavatar"
+    return shlex.quote(os.path.relpath(own) if own.is_relative_to(Path.cwd()) else str(own))
 
 
 def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:

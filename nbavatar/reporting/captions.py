@@ -10,7 +10,7 @@ from nbavatar.methods.registry import METHODS
 from nbavatar.reporting.cells import COLUMNS, Source, plain
 from nbavatar.reporting.printed import deviating_marks, deviating_means
 
-__all__ = ["describe_deviations", "describe_protocol", "describe_speeds", "describe_trainings"]
+__all__ = ["describe_deviations", "describe_few_steps", "describe_protocol", "describe_speeds", "describe_trainings"]
 
 _SPLITS = {
     "novel_view": "training frames in the held-out camera",
@@ -18,6 +18,7 @@ _SPLITS = {
     "all": "all frames",
 }
 _NETS = {"alex": "AlexNet", "vgg": "VGG16"}
+_FEW_STEPS = 1000  # in fewer, no method has got anywhere: which is ahead says nothing about them
 _MARKS = {"best": "bold", "second": "underlined", "": "unmarked"}
 
 
@@ -92,6 +93,15 @@ def describe_trainings(layout: TableLayout, results: Sequence[tuple[Mapping[str,
         budget = f", {' to '.join(f'{n:,}' for n in dict.fromkeys((steps[0], steps[-1])))} steps" if steps else ""
         words.append(f"{plain(row.label)}: {method}{mode}{budget}")
     return [f"Trained here: {'; '.join(dict.fromkeys(words))}."] if words else []
+
+
+def describe_few_steps(layout: TableLayout, results: Sequence[tuple[Mapping[str, Any], Source]]) -> str:
+    """A sentence for the caption where all trainings were too short to compare methods by; else empty."""
+    trainings = [r["training"] for r, _ in results if r["variant"] in layout.variants and r.get("training")]
+    steps = [int(training["steps"]) for training in trainings if training.get("steps") is not None]
+    if not steps or max(steps) >= _FEW_STEPS or layout.kind == "cameras":
+        return ""
+    return f"{max(steps):,} training steps rank nothing: they show that every stage runs, not which method is better."
 
 
 def describe_deviations(layout: TableLayout, panel: Panel, printed: pd.DataFrame) -> list[str]:

@@ -19,6 +19,7 @@ import pandas as pd
 from nbavatar.config.tables import TIMED, TRAINED, Panel, TableLayout, TableRow
 from nbavatar.reporting.captions import (
     describe_deviations,
+    describe_few_steps,
     describe_protocol,
     describe_speeds,
     describe_trainings,
@@ -88,7 +89,8 @@ def build_table(
         notes += _notes(layout, panel, printed, results, lpips_net)
     cells = pd.concat(blocks, ignore_index=True)
     notes = tuple(dict.fromkeys(notes))
-    return Table(name, layout.title, layout.head, layout.label, _caption(layout), notes, panels, cells)
+    caption = " ".join(filter(None, (_caption(layout), describe_few_steps(layout, results))))
+    return Table(name, layout.title, layout.head, layout.label, caption, notes, panels, cells)
 
 
 def _caption(layout: TableLayout) -> str:

@@ -54,6 +54,19 @@ def test_smoke_is_warm_and_takes_its_profile(calls, tmp_path, monkeypatch):
     assert (tmp_path / "config" / "smoke.yaml").is_file()
 
 
+def test_the_last_lines_say_how_to_look_at_the_result(calls, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name, text in (("report/index.html", "page"), ("tables/a.md", "## Table\n<!-- {} -->\n| a |\n")):
+        path = tmp_path / "results" / "smoke" / name
+        path.parent.mkdir(parents=True)
+        path.write_text(text, encoding="utf-8")
+    assert main(["run", "smoke", "--cores", "2"]) == 0
+    *table, viewer, report = capsys.readouterr().out.splitlines()
+    assert "## Table" in table and not any("<!--" in line for line in table)
+    assert viewer.startswith("viewer: ") and viewer.endswith("nbavatar view results/smoke")
+    assert report == "report: results/smoke/report/index.html"
+
+
 def test_a_capture_is_handed_over_as_text_whatever_its_name(calls, tmp_path, monkeypatch):
     """Snakemake reads `--config` values as YAML: `007` would be a number, `a: b` a mapping."""
     import yaml

@@ -203,6 +203,15 @@ def test_cost_stands_beside_quality_with_mode_and_budget_of_every_method(tmp_pat
     assert {cell["text"] for key, cell in cells.items() if key[2] == "GA"} == {""}
     said = "Trained here: SA: splatting avatar, mode paper, 30,000 steps; Ours: billboards, 1,200 steps."
     assert said in markdown and said in latex
+    assert "rank nothing" not in markdown
+
+
+def test_the_caption_says_when_trainings_were_too_short_to_rank_anything(tmp_path):
+    trained = {"method": "billboards", "steps": 120}
+    paths = [evaluation(tmp_path, "S2", v, "nv1024", 64, training=trained) for v in ("full", "splatting_avatar")]
+    _, markdown, latex = make(tmp_path, "cost", paths)
+    said = "120 training steps rank nothing: they show that every stage runs, not which method is better."
+    assert said in markdown.split("| ")[0] and said in latex.partition("\\caption")[2].partition("\n")[0]
 
 
 def test_baselines_fill_the_rows_of_the_paper(tmp_path):
