@@ -52,6 +52,7 @@ VERBS = {
     "bench": "benchmarks of single kernels: raster, deform, spectral, fit",
     "run": "the whole pipeline in one command: smoke, capture or paper",
     "warm": "run a command, such as snakemake, in which the verbs that need torch start at once",
+    "completion": "what bash, zsh or tcsh needs to complete these commands and their options",
     "doctor": "what this machine can do, and what is missing for which stage",
     "schema": "write the configuration's JSON schema and reference page",
 }

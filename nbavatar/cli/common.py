@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from nbavatar.config.core import from_mapping
-from nbavatar.config.yamlfiles import read_yaml
-from nbavatar.errors import ConfigError, parsing
+from nbavatar.config.core import from_mapping, merge
+from nbavatar.config.yamlfiles import parse_yaml, read_yaml
+from nbavatar.errors import ConfigError, describe, parsing
 
-__all__ = ["add_cfg_argument", "progress", "read_mapping", "stage_config"]
+__all__ = ["add_cfg_argument", "progress", "read_mapping", "read_settings", "stage_config"]
 
 T = TypeVar("T")
 Item = TypeVar("Item")
@@ -26,11 +26,40 @@ def add_cfg_argument(parser: argparse.ArgumentParser, cls: type) -> None:
         help=f"options of this stage ({cls.__name__}, see config/README.md) as JSON text, "
         "or a .json or .yaml file; what is not named keeps the paper's value",
     )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="one option, over --cfg, such as steps=500 or billboards.rates.features=1e-3; may be given several times",
+    )
 
 
 def stage_config(args: argparse.Namespace, cls: type[T]) -> T:
-    """The stage's configuration from `--cfg`; wrong keys, types and ranges end in one line."""
-    return from_mapping(cls, read_mapping(args.cfg, "--cfg"), "--cfg")
+    """The stage's configuration from `--cfg` and `--set`; wrong keys, types and ranges end in one line."""
+    mapping = read_mapping(args.cfg, "--cfg")
+    if not args.set:
+        return from_mapping(cls, mapping, "--cfg")
+    return from_mapping(cls, merge(mapping, read_settings(args.set)), "--set" if args.cfg == "{}" else "--cfg, --set")
+
+
+def read_settings(words: Iterable[str]) -> dict[str, Any]:
+    """Options given one by one, `key.sub=value` with the value in YAML, as a nested mapping; the last of a key counts.
+
+    Raises:
+        ConfigError: no `=`, an empty key, or a value that is no YAML.
+    """
+    settings: dict[str, Any] = {}
+    for word in words:
+        key, equals, text = word.partition("=")
+        names = key.strip().split(".")
+        if not equals or not all(names):
+            raise ConfigError.of("--set", expected="key=value or key.sub=value", found=describe(word))
+        value = parse_yaml(text, f"--set {key}")
+        for name in reversed(names):
+            value = {name: value}
+        settings = merge(settings, value)
+    return settings
 
 
 def read_mapping(text: str, option: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ Standard library only: the Snakefile imports this on every call.
 """
 
 import dataclasses
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -14,6 +15,8 @@ from nbavatar.errors import ConfigError, describe, did_you_mean
 __all__ = ["from_mapping", "json_schema", "merge", "option", "to_mapping"]
 
 T = TypeVar("T")
+
+_EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
 
 
 def option(
@@ -44,8 +47,8 @@ def option(
 def from_mapping(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
     """Reads a mapping into the dataclass `cls`.
 
-    Unknown keys, values of another type (a `1e-3` that YAML reads as text, a number
-    where text belongs) and values out of range are refused.
+    Unknown keys, values of another type (a number where text belongs) and values out of range are refused. `1e-3`,
+    which YAML 1.1 reads as text, is a number where a number with a fraction is meant.
 
     Raises:
         ConfigError: one line that names `where` and the key.
@@ -159,13 +162,14 @@ def _read(hint: Any, value: Any, metadata: Mapping[str, Any], where: str) -> Any
 
 
 def _check_scalar(hint: Any, value: Any, where: str) -> Any:
+    if hint is float and isinstance(value, str) and _EXPONENT.fullmatch(value):  # what YAML 1.1 reads as text
+        value = float(value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if hint is float and isinstance(value, float) and value != value:
         raise ConfigError.of(where, expected="a number", found="NaN")
     if (hint is int and isinstance(value, bool)) or not isinstance(value, hint):
-        hint_text = "write exponents as 1.0e-3" if hint is float and isinstance(value, str) else ""
-        raise ConfigError.of(where, expected=_type_name(hint), found=describe(value), fix=hint_text)
+        raise ConfigError.of(where, expected=_type_name(hint), found=describe(value))
     return value
 
 

@@ -26,7 +26,7 @@ Beside it stand sheets, tab-separated, in which every id is text: `subjects.tsv`
 camera) and `runs.tsv` (subject, variant, protocol: one line for each number to produce; subject `*` means all).
 `tables.yaml` lays the tables out, `reported.csv` holds what the paper printed.
 
-Mind YAML: write exponents as `1.0e-3` (`1e-3` is text), and quote ids that look like numbers.
+Mind YAML: quote ids that look like numbers.
 """
 
 

@@ -34,6 +34,17 @@ def test_to_mapping_inverts_from_mapping():
     assert from_mapping(Outer, json.loads(json.dumps(to_mapping(value))), "cfg") == value
 
 
+@pytest.mark.parametrize("text", ["1e-3", "1E-3", "+1e-3", "1.e-3", "10e-4", "0.1e-2"])
+def test_an_exponent_that_yaml_reads_as_text_is_a_number_where_one_is_meant(text):
+    from nbavatar.config.yamlfiles import parse_yaml
+
+    for value in (text, parse_yaml(f"rate: {text}", "x")["rate"]):
+        assert from_mapping(Outer, {"inner": {"rate": value}}, "cfg").inner.rate == 1e-3
+    for value in ({"net": "1e-3"}, {"net": "alex", "rate": "e-3"}):
+        with pytest.raises(ConfigError):
+            from_mapping(Outer, {"inner": value}, "cfg")
+
+
 @pytest.mark.parametrize(
     ("mapping", "words"),
     [
@@ -42,7 +53,9 @@ def test_to_mapping_inverts_from_mapping():
         ({"steps": 0}, ["cfg.steps", "at least 1", "0"]),
         ({"steps": 101}, ["cfg.steps", "at most 100"]),
         ({"steps": True}, ["cfg.steps", "a whole number", "True"]),
-        ({"inner": {"rate": "1e-3"}}, ["cfg.inner.rate", "a number", "1.0e-3"]),
+        ({"inner": {"rate": "1e-3m"}}, ["cfg.inner.rate", "a number", "'1e-3m'"]),
+        ({"inner": {"rate": "0.5"}}, ["cfg.inner.rate", "a number", "'0.5'"]),
+        ({"shares": ["2e1"]}, ["cfg.shares[0]", "at most 1", "20.0"]),
         ({"inner": {"rate": float("nan")}}, ["cfg.inner.rate", "NaN"]),
         ({"inner": {"net": "vggg"}}, ["cfg.inner.net", "one of alex, vgg"]),
         ({"shares": [0.1, 2.0]}, ["cfg.shares[1]", "at most 1"]),
