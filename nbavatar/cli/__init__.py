@@ -46,6 +46,7 @@ VERBS = {
     "video": "a turntable or a driven sequence as mp4",
     "view": "an avatar in the browser: orbit, play, compare",
     "export": "an avatar or its meshes as .ply, .glb, .obj, .safetensors or .onnx",
+    "compare": "quality against the time of training: variants, budgets, seeds",
     "report": "one self-contained HTML page with tables and pictures",
     "tradeoff": "speed against quality of an avatar, setting by setting; presets",
     "extremes": "every numerical kernel at its limits, against an oracle: exact, degrades or refuses",

@@ -22,6 +22,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nbavatar.cli.common import add_cfg_argument, progress, read_mapping, stage_config
 from nbavatar.config.core import from_mapping, merge, to_mapping
 from nbavatar.config.evaluation import PROTOCOLS, EvaluateConfig, ProtocolConfig, protocol_hash
@@ -133,8 +135,13 @@ def _evaluate(
         for name in render.frames:
             camera, _, frame = name.partition("/")
             pack = truths[camera]
-            prediction = blank_unseen(render.read("rgb", name), pack.unseen(frame), protocol.background)
-            yield Pair(camera, frame, prediction, pack.read("rgb", frame), pack.read("alpha", frame))
+            unseen = pack.unseen(frame)
+            prediction = blank_unseen(render.read("rgb", name), unseen, protocol.background)
+            alpha = pack.read("alpha", frame)
+            coverage = render.read("alpha", name) if "alpha" in render.layers else None
+            if coverage is not None and unseen is not None:
+                coverage = np.where(unseen, alpha, coverage)  # where nothing is known, nothing is wrong
+            yield Pair(camera, frame, prediction, pack.read("rgb", frame), alpha, coverage)
 
     result = evaluate(
         progress(pairs(), f"evaluate {protocol.name}", len(render.frames)),

@@ -2,6 +2,7 @@
 
     nbavatar run smoke               a tiny synthetic subject through every stage, minutes on two cores
     nbavatar run capture FOLDER      an avatar, metrics, pictures and a report of your own capture
+    nbavatar run compare FOLDER      three methods on one or more captures, at several budgets and seeds
     nbavatar run paper               every table of the paper; needs the Decaf dataset and the body models
 
 The first call copies the configuration files (`config/`) and the page that says where data belongs
@@ -35,17 +36,22 @@ __all__ = ["add_arguments", "copy_configuration", "main", "pipeline_folder"]
 _WHAT = {
     "smoke": "a tiny synthetic subject through every stage",
     "capture": "train and evaluate an avatar on your own capture",
+    "compare": "quality against the time of training, methods side by side, on your own captures",
     "paper": "every table of the paper",
 }
+_OF_CAPTURES = ("capture", "compare")
+_LAYERED = {"compare": ("config/capture.yaml", "config/methods.yaml", "config/compare.yaml")}
 _OURSELVES = (sys.executable, "-m", "nbavatar")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
-    what = parser.add_subparsers(dest="what", required=True, metavar="smoke|capture|paper", parser_class=_Parser)
+    what = parser.add_subparsers(
+        dest="what", required=True, metavar="smoke|capture|compare|paper", parser_class=_Parser
+    )
     for name, text in _WHAT.items():
         own = what.add_parser(name, help=text, description=text, epilog="What follows `--` goes to snakemake.")
-        if name == "capture":
+        if name in _OF_CAPTURES:
             own.add_argument("folder", metavar="FOLDER", help="the capture")
         own.add_argument("--cores", type=int, metavar="N", help="processors to use (default: all)")
         own.add_argument("--profile", metavar="NAME", help="where jobs run, if not on this machine: slurm, kubernetes, "
@@ -66,7 +72,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(args: argparse.Namespace) -> int:
     """Runs snakemake on the workflow; its exit code."""
-    if args.what == "capture" and not Path(args.folder).is_dir():
+    if args.what in _OF_CAPTURES and not Path(args.folder).is_dir():
         raise DataError.of(args.folder, expected="a capture's folder", found="none")
     if importlib.util.find_spec("snakemake") is None:
         raise DependencyError(f"nbavatar run needs snakemake, which is not installed; {install_line('snakemake')}")
@@ -113,11 +119,11 @@ def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:
         words += ["--workflow-profile", str(source / "profiles" / "ci")]
     words += args.snakemake
     given = read_words(args.snakemake)
-    configfiles = given.configfiles or (f"config/{args.what}.yaml",)
+    configfiles = given.configfiles or _LAYERED.get(args.what, (f"config/{args.what}.yaml",))
     check_files(given, configfiles, source)
     if not given.configfiles:
         words += ["--configfile", *configfiles]
-    if args.what == "capture":
+    if args.what in _OF_CAPTURES:
         # As a quoted text: snakemake reads values as YAML, where a folder may look like a number. Of two `--config`
         # it takes the last.
         words += ["--config", *given.values, f"data_root={json.dumps(args.folder, ensure_ascii=False)}"]

@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from nbavatar.config.compare import CompareRun, compared
 from nbavatar.config.core import from_mapping, merge, option, to_mapping
 from nbavatar.config.evaluation import (
     EvaluateConfig,
@@ -103,6 +104,7 @@ class RunConfig:
     videos: list[str] = option([], "Variants of which a turntable and a driven video are made, for every subject.")
     reenact: list[str] = option([], "Pairs source/target of subjects: the source is shown in the target's poses.")
     tradeoff: TradeoffRun = option(TradeoffRun, "Speed against accuracy.")
+    compare: CompareRun = option(CompareRun, "Quality against the time of training, with the spread over seeds.")
     extremes: str = option(
         "",
         "Also drive every kernel to its limits: quick, full, or empty for not in this run.",
@@ -162,7 +164,26 @@ def load_run(mapping: Mapping[str, Any], where: str = "config") -> RunConfig:
     for pair in run.reenact:
         if pair.count("/") != 1:
             raise ConfigError.of(f"{where}.reenact", expected="pairs source/target", found=repr(pair))
-    return run
+    return _with_compared(run, where)
+
+
+def _with_compared(run: RunConfig, where: str) -> RunConfig:
+    """The run with a variant for every avatar of its comparison."""
+    for kind, names, known in (
+        ("variant", run.compare.variants, run.variants),
+        ("protocol", run.compare.protocols if run.compare.variants else [], run.protocols),
+    ):
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"{where}.compare: unknown {kind} '{name}'; {did_you_mean(name, known)}")
+    derived = {}
+    for one in compared(run.compare):
+        variant = run.variants[one.variant]
+        stages = merge(variant.stages, {"train": one.options()})
+        derived[check_name(one.name, f"{where}.compare", error=ConfigError)] = dataclasses.replace(
+            variant, stages=stages
+        )
+    return dataclasses.replace(run, variants={**run.variants, **derived})
 
 
 def stage_options(run: RunConfig, stage: str, variant: str | None = None) -> dict[str, Any]:

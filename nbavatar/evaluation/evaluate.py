@@ -11,6 +11,7 @@ products (TF32) that GPUs take by default, so devices differ by rounding only (1
     lpips_*    whole image, by backbone
     psnr_fg    pixels whose true coverage reaches the threshold [dB]; absent where there are none
     ssim_fg    windows centred there
+    over       coverage too much, and `under`: too little, as shares of the true area; absent where a render has none
 
 Trivial answers, judged in the same way, say what the figures are worth: the background alone, and the mean
 training image (of the same camera where it was trained on, else over all training cameras).
@@ -27,6 +28,7 @@ import torch
 from torch import Tensor
 
 from nbavatar.errors import DataError
+from nbavatar.evaluation.silhouette import silhouette_error
 from nbavatar.evaluation.truth import foreground, nobody
 from nbavatar.metrics.lpips import LPIPS
 from nbavatar.metrics.psnr import psnr
@@ -48,6 +50,7 @@ class Pair:
         prediction: uint8 [H, W, 3], already on the protocol's background.
         rgb: uint8 [H, W, 3], true colours.
         alpha: uint8 [H, W], true coverage, 255 = full.
+        coverage: uint8 [H, W], the render's, or None where it is not known.
     """
 
     camera: str
@@ -55,6 +58,7 @@ class Pair:
     prediction: np.ndarray
     rgb: np.ndarray
     alpha: np.ndarray
+    coverage: np.ndarray | None = None
 
 
 def composite(rgb: np.ndarray, alpha: np.ndarray, background: Sequence[float]) -> np.ndarray:
@@ -216,9 +220,12 @@ def _evaluate(
         with torch.inference_mode():
             features = {name: net.features(truth) for name, net in nets.items()}
         prediction = _tensor(pair.prediction.astype(np.float32) / np.float32(255), device)
-        per_image.append(
-            {"camera": pair.camera, "frame": pair.frame, **measure(prediction, truth, mask, nets, features)}
-        )
+        values = measure(prediction, truth, mask, nets, features)
+        if pair.coverage is not None:
+            shown = bool(mask.any())
+            over, under = silhouette_error(pair.coverage, pair.alpha)
+            values |= {"over": over if shown else None, "under": under if shown else None}
+        per_image.append({"camera": pair.camera, "frame": pair.frame, **values})
         if not trivial:
             continue
         for answer, key, make in _trivial_answers(pair, background, means):

@@ -10,6 +10,8 @@ from types import SimpleNamespace
 
 from snakemake.exceptions import WorkflowError
 
+from nbavatar.config.compare import compared
+from nbavatar.config.core import to_mapping
 from nbavatar.config.figures import read_figures
 from nbavatar.config.inputs import (
     files_digest,
@@ -19,7 +21,7 @@ from nbavatar.config.inputs import (
     supplied_digest,
 )
 from nbavatar.config.run import load_run, stage_options
-from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
+from nbavatar.config.sheets import Row, capture_subjects, read_rows, read_subjects
 from nbavatar.config.synthetic import refuse_others
 from nbavatar.config.tables import read_tables
 from nbavatar.errors import NBAvatarError, did_you_mean
@@ -41,7 +43,14 @@ try:
     # Before snakemake knows that these files are outputs: those of a job are removed before it starts.
     if RUN.synthetic:
         refuse_others(RUN.data_root)
-    ROWS = read_rows(RUN.runs, list(SUBJECTS))
+    COMPARED = compared(RUN.compare)
+    # A comparison has rows of its own, the smallest budget of all subjects first.
+    ROWS = [
+        Row(subject, one.name, protocol)
+        for one in COMPARED
+        for subject in SUBJECTS
+        for protocol in RUN.compare.protocols
+    ] or read_rows(RUN.runs, list(SUBJECTS))
     for row in ROWS:
         for kind, name, known in (
             ("variant", row.variant, RUN.variants),
@@ -51,8 +60,8 @@ try:
                 raise NBAvatarError(
                     f"{RUN.runs}: unknown {kind} '{name}'; {did_you_mean(name, known)}"
                 )
-    TABLES = read_tables(RUN.tables)
-    FIGURES = read_figures(RUN.figures) if RUN.figures else {}
+    TABLES = {} if COMPARED else read_tables(RUN.tables)
+    FIGURES = read_figures(RUN.figures) if RUN.figures and not COMPARED else {}
     # Where one camera recorded a subject none is held out: there are no novel views of it to judge, or to show.
     ROWS = [
         row
@@ -522,17 +531,32 @@ def tradeoffs(variants, also):
 TRADEOFFS = tradeoffs(RUN.tradeoff.variants, RUN.tradeoff.also)
 
 
-EVERYTHING = [
-    *videos(),
-    *TRADEOFFS,
-    *([f"{R}/extremes/table.md"] if RUN.extremes else []),
-    *(f"{R}/figures/{figure}.png" for figure in FIGURES),
-    *evals_of(ROWS),
-    f"{R}/results.csv",
+COMPARISON = [
+    f"{R}/compare/compare.md",
+    f"{R}/compare/compare.csv",
     *(
-        f"{R}/tables/{table}.{suffix}"
-        for table in TABLES
-        for suffix in ("csv", "md", "tex")
+        f"{R}/compare/{subject}_{protocol}.png"
+        for subject, protocol in dict.fromkeys(
+            (row.subject, row.protocol) for row in ROWS
+        )
     ),
-    f"{R}/report/index.html",
 ]
+
+EVERYTHING = (
+    COMPARISON
+    if COMPARED
+    else [
+        *videos(),
+        *TRADEOFFS,
+        *([f"{R}/extremes/table.md"] if RUN.extremes else []),
+        *(f"{R}/figures/{figure}.png" for figure in FIGURES),
+        *evals_of(ROWS),
+        f"{R}/results.csv",
+        *(
+            f"{R}/tables/{table}.{suffix}"
+            for table in TABLES
+            for suffix in ("csv", "md", "tex")
+        ),
+        f"{R}/report/index.html",
+    ]
+)

@@ -97,3 +97,24 @@ rule report:
         " --pictures {input.pictures:q} --videos {input.videos:q} --tradeoffs {input.tradeoffs:q}"
         " --extremes {input.extremes:q} --size-label={params.label:q}"
         " --out {output:q} --cfg {params.cfg:q} > {log:q} 2>&1"
+
+
+if COMPARED:
+
+    # Figures of all avatars of a comparison. By hand, `nbavatar compare` draws what there is so far.
+    rule compare:
+        input:
+            evals_of(ROWS),
+        output:
+            COMPARISON,
+        log:
+            "logs/{run}/compare.log".format(run=RUN.run),
+        resources:
+            mem="2GB",
+            runtime="10m",
+        params:
+            folder=f"{R}/compare",
+            cfg=json.dumps(to_mapping(RUN.compare), sort_keys=True),
+            code=code_digest("compare"),
+        shell:
+            "nbavatar compare --evals {input:q} --out {params.folder:q} --cfg {params.cfg:q} > {log:q} 2>&1"
