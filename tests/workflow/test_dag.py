@@ -133,8 +133,9 @@ def test_methods_are_laid_over_a_capture(project, tmp_path):
 
 def test_a_comparison_has_avatars_of_its_own(project, tmp_path):
     root = f"data_root={write_capture(tmp_path / 'toy')}"
-    files = "config/capture.yaml config/methods.yaml config/compare.yaml"
-    jobs = project.plan("--config", root, "compare={seeds: [0, 1], minutes: [2, 5]}", config=files)
+    (project.folder / "few.json").write_text('{"compare": {"seeds": [0, 1], "minutes": [2, 5]}}')
+    files = "config/capture.yaml config/methods.yaml config/compare.yaml few.json"
+    jobs = project.plan("--config", root, config=files)
     # Four variants; what has no shell is trained once more on the meshes without. No report, tables or videos.
     assert jobs["train"] == 16 and jobs["evaluate"] == 32 and jobs["compare"] == 1 and jobs["shell"] == 1
     assert not {"table", "figure", "report", "video", "speed"} & jobs.keys()
