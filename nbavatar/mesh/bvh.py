@@ -3,8 +3,12 @@
 A bounding volume hierarchy (`nbavatar.mesh.tree`) is built once for a mesh's connectivity and refitted when its
 vertices move. It answers closest point queries within a radius, and inside tests by ray crossings or the generalised
 winding number (`nbavatar.mesh.winding`). Holes (neck, wrist) are closed for the inside test by a fan over each border
-loop; fans are never a closest face. libigl has the same queries but rebuilds its tree on every call (about 30 ms for a
-head), which a sequence cannot afford; the tests hold the two against each other.
+loop; fans are never a closest face.
+
+libigl has the same queries but builds its tree again when vertices have moved, which a sequence cannot afford: signed
+distances of 642 points from a head of 18,624 faces that moves before every query took 95 times as long (`AABB` and
+`fast_winding_number`: 96 times; medians of ratios of 25 frames in turns, one thread; equal to 2e-17 m). The tests
+hold the two against each other.
 """
 
 import numpy as np

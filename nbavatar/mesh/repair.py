@@ -3,6 +3,7 @@
 import numpy as np
 
 from nbavatar.errors import require
+from nbavatar.mesh.consistency import signed_volume
 
 __all__ = ["repair_faces"]
 
@@ -37,7 +38,7 @@ def repair_faces(verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, list
     labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(wound))
     for label in range(int(labels.max(initial=-1)) + 1):
         rows = labels == label
-        if _volume(verts, wound[rows]) < 0:
+        if signed_volume(verts, wound[rows]) < 0:
             wound[rows] = wound[rows][:, ::-1]
     turned = int((_rotated(wound) != _rotated(kept)).any(axis=1).sum())
     if turned:
@@ -45,13 +46,6 @@ def repair_faces(verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, list
     # A face that was not turned keeps its corners as they were, first corner included.
     same = (_rotated(wound) == _rotated(kept)).all(axis=1)
     return np.where(same[:, None], kept, wound), said
-
-
-def _volume(verts: np.ndarray, faces: np.ndarray) -> float:
-    """Signed volume of the cones from the middle of the faces' corners."""
-    corners = np.asarray(verts, dtype=np.float64)[faces]
-    corners = corners - corners.reshape(-1, 3).mean(axis=0)
-    return float(np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum())
 
 
 def _rotated(faces: np.ndarray) -> np.ndarray:

@@ -6,6 +6,10 @@ three signed volumes ``r . (Xj x Xk)`` are, up to a common factor, the perspecti
 (homogeneous rasterization, Olano and Greer 1997). Two things follow. Triangles that cross the camera plane need no
 clipping, only a comparison per pixel; and the volumes of an edge seen from its two triangles are exact negatives of
 each other in floating point, so closed surfaces have no cracks.
+
+Rays through a tree see the same: libigl's (`AABB.intersect_ray_first`) took 10 times as long for 256 x 256 pixels of
+18,624 faces (median of 5 in turns, one thread), and `align` and `masks` draw every frame. Rays are the oracle of the
+tests.
 """
 
 import os

@@ -1,7 +1,7 @@
 """Cells of the Laplacians and the spectral coordinates, float64.
 
 A function that is linear on a flat patch has the patch's area as its Dirichlet energy, however bad the triangles are:
-an oracle without any discretisation error. The textbook operator is compared with cotangents in mpmath.
+an oracle without any discretisation error.
 """
 
 from typing import Any
@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from nbavatar.mesh.frames import face_frames
-from nbavatar.mesh.laplacian import cotangent_laplacian, robust_laplacian
+from nbavatar.mesh.laplacian import robust_laplacian
 from nbavatar.mesh.spectral import spectral_coordinates
 from nbavatar.mesh.texels import texel_values
-from nbavatar.studies.extremes.cells import DOUBLE, Level, Limit, Sample, Tolerance, cell
-from nbavatar.studies.extremes.compare import precise, relative
+from nbavatar.studies.extremes.cells import Level, Limit, Sample, Tolerance, cell
+from nbavatar.studies.extremes.compare import relative
 from nbavatar.studies.extremes.frames import patch
 
 __all__: list[str] = []
@@ -190,51 +190,6 @@ def _refused(case: str) -> Sample:
         verts = verts * 0 + 1.0
     robust_laplacian(verts, faces)
     return Sample(float("nan"))
-
-
-@cell(
-    "laplacian",
-    "cotangent_laplacian",
-    "obtuse triangles",
-    "largest angle [deg]",
-    (90.0, 120.0, 170.0, 179.9, 179.9999),
-    oracle="cotangents with 50 digits (mpmath)",
-    exact=DOUBLE,
-)
-def _cotangents(angle: float) -> Sample:
-    import mpmath
-
-    verts, faces, _ = _flat(shear=-float(np.tan(np.radians(angle - 90.0))))
-    found = cotangent_laplacian(verts, faces)[0].toarray()
-    with mpmath.workdps(50):
-        true = np.zeros(found.shape)
-        exact = precise(verts)
-        for face in faces:
-            for corner in range(3):
-                i, j, k = (face[(corner + step) % 3] for step in range(3))
-                a, b = exact[j] - exact[i], exact[k] - exact[i]
-                cross = np.cross(a, b)
-                half = float((a @ b) / mpmath.sqrt(cross @ cross)) / 2
-                for row, column, sign in ((j, k, -1), (k, j, -1), (j, j, 1), (k, k, 1)):
-                    true[row, column] += sign * half
-    return Sample(relative(found, true))
-
-
-@cell(
-    "laplacian",
-    "cotangent_laplacian",
-    "zero-area triangle",
-    "height / edge [1]",
-    (1.0, 1e-6, 0.0),
-    oracle="finite; rows sum to 0",
-    exact=Tolerance(1e-6, 1.0),
-)
-def _zero_area(height: float) -> Sample:
-    verts, faces, _ = _flat()
-    verts = np.concatenate((verts, [[1 / 6, -height / 3, 0.0]]))
-    faces = np.concatenate((faces, [[4, 0, 16]]))
-    stiffness, mass = cotangent_laplacian(verts, faces)
-    return Sample(max(relative(stiffness.sum(0), np.zeros(17)), 0.0 if np.isfinite(mass).all() else float("nan")))
 
 
 def _spectral(condition: str, axis: str, levels: tuple[Level, ...], **more: Any):

@@ -41,6 +41,12 @@ def test_obj_with_a_texture_seam_is_what_trimesh_reads(tmp_path):
     np.testing.assert_array_equal(verts[faces], oracle.vertices[oracle.faces])
 
 
+def test_ids_that_count_backwards_count_from_their_line(tmp_path):
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n"
+    (tmp_path / "a.obj").write_text(corners + corners)
+    assert read_mesh_file(tmp_path / "a.obj")[1].tolist() == [[0, 1, 2], [3, 4, 5]]
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
 def test_ply(tmp_path, encoding):
     verts = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)

@@ -7,7 +7,7 @@ import scipy.linalg
 import torch
 
 from nbavatar.mesh.frames import face_frames
-from nbavatar.mesh.laplacian import cotangent_laplacian, robust_laplacian
+from nbavatar.mesh.laplacian import robust_laplacian
 from nbavatar.mesh.spectral import spectral_coordinates
 from nbavatar.mesh.texels import texel_values
 from tests.unit.mesh.shapes import grid, sphere, torus
@@ -88,8 +88,7 @@ def test_agrees_with_a_dense_solver_on_libigls_matrices():
     verts, faces = sphere(3)
     verts = verts * [1.0, 1.2, 1.45]
     stiffness = -igl.cotmatrix(verts, faces).toarray()
-    ours, mass = cotangent_laplacian(verts, faces)
-    np.testing.assert_allclose(ours.toarray(), stiffness, atol=1e-12)
+    mass = igl.massmatrix(verts, faces, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal()
     values = scipy.linalg.eigh(stiffness, np.diag(mass), eigvals_only=True, subset_by_index=(1, 6))
     result = spectral_coordinates(verts, faces, modes=6)
     # Not the same triangulation (ours is intrinsic Delaunay), hence not the same digits.

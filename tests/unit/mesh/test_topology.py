@@ -9,7 +9,6 @@ from nbavatar.mesh.topology import (
     boundary_edges,
     boundary_loops,
     edges,
-    face_neighbours,
     mesh_defects,
     unreferenced_vertices,
     validate_mesh,
@@ -68,11 +67,42 @@ def test_two_holes_that_touch_in_a_vertex_use_every_border_edge_once():
     assert sum(map(len, loops)) == 6 and len(loops) == 2
 
 
-def test_adjacency_and_face_neighbours_equal_trimesh(two_balls):
+def test_many_holes_that_touch_use_every_border_edge_once():
+    faces = np.asarray(trimesh.creation.icosphere(subdivisions=3).faces, np.int64)
+    faces = faces[np.random.default_rng(0).permutation(len(faces))[:900]]
+    loops = boundary_loops(faces)
+    found = [pair for loop in loops for pair in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True)]
+    assert sorted(found) == sorted(map(tuple, boundary_edges(faces).tolist()))
+
+
+def test_borders_adjacency_and_components_of_any_faces():
+    # Faces drawn at random: non-manifold edges, holes that touch, vertices without a face, none at all.
+    rng = np.random.default_rng(3)
+    for count in (0, 1, 7, 60, 300):
+        faces = np.array([rng.permutation(40)[:3] for _ in range(count)], np.int64).reshape(-1, 3)
+        directed = [(f[i], f[(i + 1) % 3]) for f in faces.tolist() for i in range(3)]
+        uses = {}
+        for a, b in directed:
+            uses.setdefault((min(a, b), max(a, b)), []).append((a, b))
+        expected = sorted(found[0] for found in uses.values() if len(found) == 1)
+        assert sorted(map(tuple, boundary_edges(faces).tolist())) == expected
+        matrix = vertex_adjacency(faces, 45)
+        assert matrix.shape == (45, 45) and matrix.nnz == 2 * len(uses) and (matrix.data == 1.0).all()
+        assert all(matrix[a, b] == matrix[b, a] == 1.0 for a, b in uses)
+        # Components by spreading the smallest id along edges until nothing changes.
+        label = np.arange(45)
+        for _ in range(45):
+            for a, b in uses:
+                label[[a, b]] = min(label[a], label[b])
+        used = np.unique(faces)
+        component = vertex_components(faces, 45)
+        np.testing.assert_array_equal(component[used], np.unique(label[used], return_inverse=True)[1])
+        assert (np.delete(component, used) == -1).all()
+
+
+def test_adjacency_equals_trimesh(two_balls):
     verts, faces = two_balls
     mesh = trimesh.Trimesh(verts, faces, process=False)
-    ours = {tuple(sorted(pair)) for pair in face_neighbours(faces).tolist()}
-    assert ours == {tuple(sorted(pair)) for pair in mesh.face_adjacency.tolist()}
     matrix = vertex_adjacency(faces, len(verts))
     assert (matrix != matrix.T).nnz == 0
     for v in (0, 17, 50):
