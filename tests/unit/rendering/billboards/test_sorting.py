@@ -1,13 +1,15 @@
-"""Sorting networks, and what the kernels that use them may rely on."""
+"""The order of blending: sorting networks, and the queues of pixels that use them, against plain sorts."""
 
 import numba
 import numpy as np
 import pytest
+import torch
 
 from nbavatar.jit.lane_memory import load
 from nbavatar.jit.lanes import LANES, broadcast, mask_bits
 from nbavatar.jit.memory import pointer
 from nbavatar.rendering.sorting import LONGEST, comparisons, network
+from tests.unit.rendering.billboards.stages import patches, scene_of, settings
 
 _NONE = np.float32(-np.inf)
 _sort = network(LONGEST)
@@ -60,3 +62,40 @@ def test_ties_are_told():
     held = np.array([LONGEST] * 7 + [12], np.int32)  # the last lane's tie lies behind its end
     opacities, ids = keys.copy(), np.zeros(keys.shape, np.int32)
     assert _sort_queues(keys.ravel(), opacities.ravel(), ids.ravel(), held, LANES, _NONE) == 1 << 2 | 1 << 5
+
+
+def order_of_hits(queue, keys, ranks):
+    """Order in which hits, given as they come, are blended: by key, equal ones by rank; or as a queue gives them up."""
+    if queue < 0:
+        return sorted(range(len(keys)), key=lambda i: (-keys[i], ranks[i]))
+    waiting, order = [], []
+    for i in range(len(keys)):
+        waiting.append(i)
+        if len(waiting) > queue:
+            order.append(min(waiting, key=lambda j: (-keys[j], ranks[j])))
+            waiting.remove(order[-1])
+    return order + sorted(waiting, key=lambda j: (-keys[j], ranks[j]))
+
+
+@pytest.mark.parametrize(("queue", "count"), [(-1, 2), (-1, 4), (-1, 7), (-1, 15), (-1, 40), (1, 12), (3, 12)])
+def test_pixels_blend_their_hits_in_order(queue, count):
+    """Crossing planes: another order at every pixel; with a tie between two. The features tell which hit came when."""
+    depth = 1.0 + 0.001 * np.random.default_rng(3).permutation(count)
+    projection = patches(3, count, radius=(400.0, 500.0), depth=depth, tilt=0.01)
+    projection.plane[1] = projection.plane[0]  # hits of equal keys, which rank tells apart
+    features = torch.eye(count, dtype=torch.float64)[:, None, None].expand(count, 2, 2, count).contiguous()
+    alpha = torch.full((count, 2, 2), 0.1, dtype=torch.float64)
+    projection.fade[:] = 1.0
+    rank = np.random.default_rng(4).permutation(count)
+    scene = scene_of(projection, features, alpha, settings(queue, 2, t_min=0.0), rank)
+    image, _ = scene.forward()
+    found, orders = 0, set()
+    for x, y in [(0, 0), (36, 0), (17, 20), (0, 33), (36, 33), (9, 31)]:
+        keys = projection.plane[:, 2].numpy() @ (x + 0.5, y + 0.5, 1.0)
+        come = scene.bins.order
+        order = [int(come[k]) for k in order_of_hits(queue, keys[come], scene.bins.rank[come])]
+        weights = image[:, y, x].numpy()[order]
+        np.testing.assert_allclose(weights, 0.1 * 0.9 ** np.arange(count), rtol=1e-9)
+        orders.add(tuple(order))
+        found += 1
+    assert found == 6 and (count < 4 or len(orders) > 1)
