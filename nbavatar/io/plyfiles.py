@@ -1,18 +1,18 @@
-"""PLY files to write: vertices with named columns, and triangles. Binary, little endian; everything reads that.
+"""PLY files to write, by trimesh: vertices with named columns, and triangles. Binary, little endian.
 
 Reading is in `nbavatar.io.meshfiles`.
 """
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from nbavatar.errors import require
 from nbavatar.io.atomic import atomic_write
 
 __all__ = ["write_ply"]
-
-_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 
 
 def write_ply(
@@ -25,27 +25,20 @@ def write_ply(
 
     Args:
         path: the file.
-        columns: property -> one number a vertex, [V]; float32, float64, uint8 or int32, in the order of the file.
+        columns: property -> one number a vertex, [V]; x, y and z come first, and are written as float32; the others are
+            float32, float64, uint8 or int32, in the order of the file.
         faces: vertex ids, int [F, 3], or None for points.
         comments: lines of the header, ASCII.
     """
-    arrays = {name: np.asarray(value) for name, value in columns.items()}
-    counts = {len(value) for value in arrays.values()}
-    if len(counts) != 1 or any(value.ndim != 1 for value in arrays.values()):
-        raise ValueError(f"columns must be [V] with one V, found {[value.shape for value in arrays.values()]}")
-    kinds = {name: value.dtype.str[1:] for name, value in arrays.items()}
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {' '.join(line.split())}" for line in comments]
-    lines += [f"element vertex {counts.pop()}", *(f"property {_TYPES[kinds[name]]} {name}" for name in arrays)]
-    if faces is not None:
-        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    rows = np.zeros(len(next(iter(arrays.values()))), np.dtype([(name, f"<{kind}") for name, kind in kinds.items()]))
-    for name, value in arrays.items():
-        rows[name] = value
-    with atomic_write(path) as temporary, open(temporary, "wb") as stream:
-        stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace"))
-        stream.write(rows.tobytes())
-        if faces is not None:
-            corners = np.zeros(len(faces), np.dtype([("count", "u1"), ("ids", "<i4", (3,))]))
-            corners["count"], corners["ids"] = 3, faces
-            stream.write(corners.tobytes())
+    trimesh = require("trimesh", "trimesh", "writing PLY files")
+    if len({np.shape(value) for value in columns.values()}) != 1 or list(columns)[:3] != ["x", "y", "z"]:
+        found = {name: np.shape(value) for name, value in columns.items()}
+        raise ValueError(f"columns must be x, y, z and others, all [V], found {found}")
+    verts = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    shape = trimesh.PointCloud(verts) if faces is None else trimesh.Trimesh(verts, faces, process=False)
+    shape.vertex_attributes = {name: np.asarray(columns[name]) for name in list(columns)[3:]}
+    content = shape.export(file_type="ply", vertex_normal=False)
+    # trimesh writes its own address as the only comment.
+    lines = b"".join(b"comment " + " ".join(line.split()).encode("ascii", "replace") + b"\n" for line in comments)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(re.sub(rb"comment .*\n", lambda _: lines, content, count=1))
