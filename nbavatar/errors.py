@@ -8,7 +8,9 @@ of ours and keeps its traceback.
 
 import contextlib
 import importlib
+import os
 import reprlib
+import stat
 from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 from types import ModuleType
@@ -104,6 +106,9 @@ def parsing(
     Raises:
         NBAvatarError: of the class `error`; one that the block raises itself passes unchanged.
     """
+    kind = _special(where)
+    if kind:
+        raise error.of(where, field, expected=expected, found=f"{kind}, which is never read", fix="remove it")
     try:
         yield
     except (NBAvatarError, NameError, ImportError):  # ours to mend, or a package that is missing
@@ -117,6 +122,21 @@ def parsing(
         elif _is_pointer(where):
             found, fix = "a pointer of Git LFS in its place", "fetch the file itself with: git lfs pull"
         raise error.of(where, field, expected=expected, found=found, fix=fix) from cause
+
+
+def _special(where: object) -> str:
+    """What is there instead of a file: a pipe, which would be waited for, or a device, which may have no end.
+
+    What is named as one, as shells do with `<(...)`, is meant.
+    """
+    path = str(where)
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return ""
+    if stat.S_ISREG(mode) or stat.S_ISDIR(mode) or path.startswith(("/dev/", "/proc/")):
+        return ""
+    return "a pipe" if stat.S_ISFIFO(mode) else "a device or socket"
 
 
 def _is_pointer(where: object) -> bool:

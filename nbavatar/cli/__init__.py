@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 
 from nbavatar import __version__
-from nbavatar.errors import NBAvatarError, describe, did_you_mean
+from nbavatar.errors import ConfigError, NBAvatarError, describe, did_you_mean
 from nbavatar.packages import distribution_of, install_line
 
 __all__ = ["SOCKET_VARIABLE", "VERBS", "main"]
@@ -69,6 +69,29 @@ _WITH_TORCH = frozenset({"train", "render", "evaluate", "speed", "tradeoff", "ex
 _OURS = (errno.EBADF, errno.EFAULT, errno.ENOTSOCK)
 
 
+# Options that name files to write. Others that name files which are there are inputs.
+_OUTPUTS = ("out", "history", "overview", "record")
+
+
+def _keep_inputs(parsed: argparse.Namespace) -> None:
+    """Refuses to write a result in the place of an input.
+
+    Raises:
+        ConfigError: an output is one of the files to read, by whatever name or link.
+    """
+    options = {name: value if isinstance(value, (list, tuple)) else [value] for name, value in vars(parsed).items()}
+    for output in _OUTPUTS:
+        for out in options.get(output, []):
+            if not isinstance(out, (str, os.PathLike)) or not os.path.isfile(out):
+                continue
+            for name, values in options.items():
+                given = [value for value in values if isinstance(value, (str, os.PathLike)) and os.path.isfile(value)]
+                if name not in _OUTPUTS and any(os.path.samefile(out, value) for value in given):
+                    fix = "name another file: this one would be replaced"
+                    found = f"the input of --{name.replace('_', '-')}"
+                    raise ConfigError.of(out, f"--{output}", expected="a file to write", found=found, fix=fix)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one verb; returns the exit code (0 done, 2 bad input or usage, 130 interrupted)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -95,7 +118,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         module.add_arguments(own)
-        return module.main(own.parse_args(arguments[1:])) or 0
+        parsed = own.parse_args(arguments[1:])
+        _keep_inputs(parsed)
+        return module.main(parsed) or 0
     except NBAvatarError as error:
         message = str(error)
     except KeyboardInterrupt:

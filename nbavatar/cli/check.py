@@ -14,6 +14,7 @@ Lengths are metres, cameras map world to camera (OpenCV axes), pixel centres lie
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -101,7 +102,7 @@ def main(args: argparse.Namespace) -> int:
     if args.record:
         inputs = {name: root / name for name in ("cameras.json", "splits.json") if (root / name).is_file()}
         found = {"frames": len(report.frames), "defects": report.defects, "notes": report.notes}
-        found |= {"overlap": report.overlap, "astray": report.astray}
+        found |= {"overlap": report.overlap, "astray": report.astray, "folder": os.path.realpath(root)}
         write_json(args.record, run_record("check", config=to_mapping(cfg), inputs=inputs, extra=found))
     return 0
 

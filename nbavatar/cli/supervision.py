@@ -20,7 +20,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ _GRACE_S = 10.0  # for a training to save its state, for Snakemake to remove its
 _OWN_LOCKS = {"0.input.lock", "0.output.lock"}  # of a run that is the only one of its folder
 _GUARD_PIPES: set[int] = set()
 _TOLD: list[int] = []
-_POLL_S = 0.2
+_POLL_S, _BEAT_S = 0.2, 5.0
 _MOST_STREAMS = 1 << 16
 _RECORD = "nbavatar-run.json"
 # First as the keyboard would: Snakemake then ends its jobs and removes its lock.
@@ -75,7 +76,8 @@ def run_workflow(
         # Below `nbavatar warm` it is that which interrupts Snakemake.
         order = (signal.SIGTERM, signal.SIGKILL) if warm else _ORDER
         with supervised(command, os.environ, token, order, slurm) as process:
-            return wait(process)
+            record = Path(folder).resolve() / ".snakemake" / _RECORD
+            return wait(process, lambda: _beat(record))
 
 
 @contextlib.contextmanager
@@ -126,13 +128,14 @@ def told_to_end() -> bool:
     return bool(_TOLD)
 
 
-def wait(process: "subprocess.Popen[bytes]") -> int:
+def wait(process: "subprocess.Popen[bytes]", beat: Callable[[], None] = lambda: None) -> int:
     """Waits for a command; its exit code, 128 and the signal's number if a signal ended it; 143 when told to end.
 
     An interrupt from the keyboard reaches the command too, which is left to end in its own way; a second one is ours.
     """
     interrupted = False
     while not told_to_end():
+        beat()
         try:
             code = process.wait(_POLL_S)
             return code if code >= 0 else 128 - code
@@ -250,7 +253,7 @@ def _claimed(state: Path, snakemake: Sequence[str], token: str, slurm: bool) -> 
         _cancel_former(former, state.parent)
     left = sorted(path.name for path in locks.glob("*.lock"))
     if left:
-        known = former is not None and former["machine"] == machine()
+        known = former is not None and former["machine"] == machine() and not _younger(locks, record)
         if former is None or not known or not set(left) <= _OWN_LOCKS or _snakemakes(state.parent):
             found, fix = "one whose run is not known", shlex.join([*snakemake, "--unlock"])
             fix = f"if no run works there, remove it by: {fix}"
@@ -272,6 +275,22 @@ def _claimed(state: Path, snakemake: Sequence[str], token: str, slurm: bool) -> 
             shutil.rmtree(locks, ignore_errors=True)
         if not any(locks.glob("*.lock")) and _former(record) == own:
             record.unlink(missing_ok=True)
+
+
+def _beat(record: Path) -> None:
+    """Marks the record of a run that lives, now and then, by its time."""
+    with contextlib.suppress(OSError):
+        if time.time() - record.stat().st_mtime > _BEAT_S:
+            os.utime(record)
+
+
+def _younger(locks: Path, record: Path) -> bool:
+    """Whether a lock was made after the run of the record had ended: it is another's then."""
+    try:
+        ended = record.stat().st_mtime + 2 * _BEAT_S
+        return any(path.stat().st_mtime > ended for path in locks.glob("*.lock"))
+    except OSError:
+        return True
 
 
 def _cancel_former(former: dict[str, Any], folder: Path) -> None:

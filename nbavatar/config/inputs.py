@@ -36,7 +36,7 @@ def rig_digest(root: str) -> str:
     total = hashlib.sha256()
     for name in ("cameras.json", "splits.json"):
         try:
-            total.update(Path(root, name).read_bytes() + b"\0")
+            total.update(_content(Path(root, name)) + b"\0")
         except OSError:
             total.update(b"missing\0")
     return total.hexdigest()[:12]
@@ -57,9 +57,16 @@ def _file(path: str) -> str:
         known = os.stat(path)
         if known.st_size > _READ_WHOLE:
             return f"{known.st_size} {known.st_mtime_ns}"
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        return hashlib.sha256(_content(Path(path))).hexdigest()
     except OSError:
         return "missing"
+
+
+def _content(path: Path) -> bytes:
+    """What is in a file; OSError where there is none, but a pipe or a device, which has no end."""
+    if not path.is_file():
+        raise FileNotFoundError(path)
+    return path.read_bytes()
 
 
 def supplied_place(folder: str, subject: str, camera: str) -> Path | None:
@@ -139,7 +146,7 @@ def _listing(folder: str) -> list[tuple[str, str]]:
 def _frames(root: str) -> frozenset[str] | None:
     """Ids of all frames of a capture; None, which stands for every file, where `splits.json` cannot be read."""
     try:
-        stored = json.loads(Path(root, "splits.json").read_text(encoding="utf-8-sig"))
+        stored = json.loads(_content(Path(root, "splits.json")).decode("utf-8-sig"))
         return frozenset(str(frame) for frame in stored["frames"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None

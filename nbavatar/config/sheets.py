@@ -5,6 +5,7 @@ Camera and subject ids are text, always: in YAML `084` is text, `110` a number a
 
 import csv
 import dataclasses
+import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -67,6 +68,31 @@ def read_subjects(path: str | os.PathLike[str], root: str) -> dict[str, Subject]
             )  # fmt: skip
         subjects[subject.name] = subject
     return subjects
+
+
+def refuse_namesakes(subjects: Mapping[str, Subject], checks: str | os.PathLike[str]) -> None:
+    """Compares the folders of captures with those that results under their names were made of.
+
+    A capture that was moved is the same; one that is still where it was is another.
+
+    Args:
+        subjects: by name, from `capture_subjects`.
+        checks: folder of results of `nbavatar check`, `<subject>/record.json` in it.
+
+    Raises:
+        ConfigError: results of another capture would be replaced.
+    """
+    for name, subject in subjects.items():
+        path = Path(checks, name, "record.json")
+        try:
+            former = json.loads(path.read_text(encoding="utf-8"))["folder"]
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            continue
+        if isinstance(former, str) and former != os.path.realpath(subject.root) and os.path.isdir(former):
+            raise ConfigError.of(
+                subject.root, expected="a capture of its own name", found=f"'{name}', of which there are results",
+                fix=f"they were made of {former}: rename one of the folders, or run in another place",
+            )  # fmt: skip
 
 
 def capture_subjects(root: str, test_camera: str | int) -> dict[str, Subject]:

@@ -5,15 +5,18 @@ parts so many times that nobody can print it.
 """
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from nbavatar.errors import ConfigError, parsing
 
-__all__ = ["check_tree", "parse_yaml", "read_yaml"]
+__all__ = ["check_numbers", "check_tree", "parse_yaml", "read_yaml"]
 
 _MAX_ENTRIES = 1_000_000
+_MAX_DIGITS = 1_000
+_DIGITS = re.compile(r"[0-9_:.]{100,}")
 
 
 def read_yaml(path: str | os.PathLike[str], expected: str) -> Any:
@@ -36,9 +39,21 @@ def parse_yaml(text: str, where: object) -> Any:
     import yaml
 
     with parsing(where, "YAML", damaged="text that does not parse", error=ConfigError):
+        check_numbers(text)
         value = yaml.safe_load(text)
     check_tree(value, where)
     return value
+
+
+def check_numbers(text: str) -> None:
+    """Refuses numbers of thousands of digits, which take ages to read: to the base of 60, too.
+
+    Raises:
+        ValueError: there is one.
+    """
+    longest = max(map(len, _DIGITS.findall(text)), default=0)
+    if longest > _MAX_DIGITS:
+        raise ValueError(f"a number of {longest} characters")
 
 
 def check_tree(value: Any, where: object) -> None:

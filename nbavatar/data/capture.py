@@ -144,6 +144,8 @@ def read_splits(root: Path) -> Splits:
             hint = f"did you mean {meant}?" if meant else did_you_mean(str(key), _SPLITS)
             raise DataError(f"{path}: unknown key '{key}'; {hint}")
     frames = _ids(stored, "frames", path)
+    if "topology" in frames:  # meshes/topology.npz is none of a frame
+        raise DataError.of(path, "frames", expected="other names than 'topology'", found="it", fix="rename the frame")
     if not frames:
         raise DataError.of(path, "frames", expected="at least one frame id", found="none")
     train, test = _ids(stored, "train", path), _ids(stored, "test", path)

@@ -17,6 +17,7 @@ In a crop that sticks out of the camera's image, what lies outside has the label
 import contextlib
 import json
 import os
+import struct
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,6 +31,7 @@ from nbavatar.io.archives import open_archive, read_record
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.forms import check_form, matrix_form
 from nbavatar.io.images import decode_image, encode_png
+from nbavatar.io.pictures import MOST_PIXELS
 from nbavatar.io.records import canonical_json
 from nbavatar.names import check_name
 
@@ -129,8 +131,24 @@ class FramePack:
         # Renders are of several cameras, and their frames are <camera>/<frame>.
         for camera in str(self.manifest["camera"]).split(","):
             check_name(camera, path, "camera", error=DataError)
+        self._check_size()
         for piece in {piece for frame in self.frames for piece in str(frame).split("/")}:
             check_name(piece, path, "frames", error=DataError)
+
+    def _check_size(self) -> None:
+        """Compares the size that all pictures are said to have with the first that is there."""
+        width, height = self.manifest["width"], self.manifest["height"]
+        for name in [f"{layer}/{self.frames[0]}.png" for layer in self.layers if self.frames]:
+            if name not in self._archive.NameToInfo:
+                continue
+            with parsing(self.path, "a whole image", field=name, damaged="damage"), self._archive.open(name) as stream:
+                found = struct.unpack(">II", stream.read(24)[16:])
+            if found != (width, height):
+                expected, shown = f"{width} x {height} as in the manifest", f"{found[0]} x {found[1]}"
+                raise DataError.of(self.path, name, expected=expected, found=shown)
+        if width * height > MOST_PIXELS:
+            found = f"{width} x {height}"
+            raise DataError.of(self.path, "width, height", expected=f"at most {MOST_PIXELS} pixels", found=found)
 
     def __enter__(self) -> Self:
         return self

@@ -17,13 +17,14 @@ from PIL import Image
 
 from nbavatar.errors import DataError, parsing
 
-__all__ = ["PICTURE_TYPES", "Plane", "picture_size", "read_colours", "read_plane"]
+__all__ = ["MOST_PIXELS", "PICTURE_TYPES", "Plane", "picture_size", "read_colours", "read_plane"]
 
 PICTURE_TYPES = (".jpg", ".jpeg", ".png", ".webp")
 """Endings of the files that are read, in lower case."""
 
 _FORMATS = ("JPEG", "PNG", "WEBP")
-_MOST_PIXELS = 89_000_000
+MOST_PIXELS = 89_000_000
+_SHOWN_OF = 10_000  # pixels whose colours are sorted for an error line
 _ORIENTATION = 0x0112
 _NEUTRAL = {False: 0, True: 12}  # largest difference between the channels of grey pixels, without and with loss
 _KINDS = {
@@ -142,8 +143,8 @@ def _check_size(path: str | os.PathLike[str], image: Image.Image, turn: int, siz
         turned = f", turned by its EXIF orientation {turn}" if turn > 1 else ""
         expected = f"{size[0]} x {size[1]} as its camera says"
         raise DataError.of(path, "size", expected=expected, found=f"{width} x {height}{turned}")
-    if width * height > _MOST_PIXELS:
-        raise DataError.of(path, "size", expected=f"at most {_MOST_PIXELS} pixels", found=f"{width} x {height}")
+    if width * height > MOST_PIXELS:
+        raise DataError.of(path, "size", expected=f"at most {MOST_PIXELS} pixels", found=f"{width} x {height}")
     if image.format in ("PNG", "WEBP") and getattr(image, "n_frames", 1) > 1:
         raise DataError.of(path, expected="a still image", found="a moving one")
 
@@ -195,9 +196,11 @@ def _indices(image: Image.Image) -> np.ndarray:
 
 def _neutral(colours: np.ndarray, lossy: bool, path: str | os.PathLike[str]) -> np.ndarray:
     """The greys of an RGB picture, uint8 `[H, W]`."""
-    spread = colours.max(axis=2).astype(int) - colours.min(axis=2)
+    spread = colours.max(axis=2) - colours.min(axis=2)
     if spread.max(initial=0) > _NEUTRAL[lossy]:
-        kinds, counts = np.unique(colours[spread > _NEUTRAL[lossy]], axis=0, return_counts=True)
+        coloured = np.flatnonzero(spread.reshape(-1) > _NEUTRAL[lossy])
+        some = coloured[:: 1 + len(coloured) // _SHOWN_OF]
+        kinds, counts = np.unique(colours.reshape(-1, 3)[some], axis=0, return_counts=True)
         shown = ", ".join(str(tuple(map(int, kinds[i]))) for i in np.argsort(-counts, kind="stable")[:4])
         more = " and others" if len(kinds) > 4 else ""
         fix = "store one number a pixel: labels 0..3, or 0 and 255 for the person"

@@ -15,6 +15,7 @@ import torch
 from nbavatar.io.tensors import read_tensors
 from tests.cluster.loopback import available, slurm
 from tests.scenes.toy import write_scene
+from tests.scenes.training import train_options
 
 ROOT = Path(__file__).parents[2]
 pytestmark = [
@@ -112,10 +113,10 @@ rule train:
         runtime=lambda wildcards, attempt: 1 if wildcards.how == "time" and attempt == 1 else 30,
     shell: "{PYTHON} stop.py {wildcards.how} {wildcards.how} {TRAIN} --out {output} >> attempts.{wildcards.how} 2>&1"
 """
-OPTIONS = {
+OPTIONS = train_options({
     "steps": 150, "texels": 4, "unet": {"width": 4, "depth": 3, "max_width": 8, "convs": 1}, "weight_lpips": 0.0,
     "previews": 0, "coarse_side": 16, "checkpoint_seconds": 0.5,
-}  # fmt: skip
+})  # fmt: skip
 
 
 def weights(value, name=""):
@@ -139,10 +140,10 @@ def test_a_training_that_the_scheduler_ends_goes_on_to_the_same_weights(tmp_path
     )
     with slurm() as environment:
         done = subprocess.run(COMMAND, cwd=tmp_path, env=environment, capture_output=True, text=True)
-        states = subprocess.check_output(["squeue", "--states=all", "--noheader", "--format=%T"], env=environment)
+        jobs = subprocess.check_output(["squeue", "--states=all", "--noheader", "--format=%T %Z"], env=environment)
     said = done.stdout + done.stderr
     assert done.returncode == 0, said[-6000:]
-    ends = sorted(states.decode().split())
+    ends = sorted(line.split()[0] for line in jobs.decode().splitlines() if line.endswith(str(tmp_path)))
     assert ends.count("COMPLETED") == 3 and "TIMEOUT" in ends and len(ends) == 5, ends
     whole = weights(read_tensors(tmp_path / "whole/model.pt", "an avatar"))
     assert whole

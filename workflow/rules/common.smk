@@ -21,7 +21,13 @@ from nbavatar.config.inputs import (
     supplied_digest,
 )
 from nbavatar.config.run import load_run, stage_options
-from nbavatar.config.sheets import Row, capture_subjects, read_rows, read_subjects
+from nbavatar.config.sheets import (
+    Row,
+    capture_subjects,
+    read_rows,
+    read_subjects,
+    refuse_namesakes,
+)
 from nbavatar.config.synthetic import refuse_others
 from nbavatar.config.tables import read_tables
 from nbavatar.errors import NBAvatarError, did_you_mean
@@ -38,6 +44,7 @@ try:
     RUN = load_run(config)
     if RUN.layout == "capture":
         SUBJECTS = capture_subjects(RUN.data_root, RUN.test_camera)
+        refuse_namesakes(SUBJECTS, f"results/{RUN.run}/check")
     else:
         SUBJECTS = read_subjects(RUN.subjects, RUN.data_root)
     # Before snakemake knows that these files are outputs: those of a job are removed before it starts.

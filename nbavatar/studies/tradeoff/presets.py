@@ -104,7 +104,10 @@ def store_presets(
     measured = []
     if Path(path).is_file():
         stored = read_json(path)
-        if isinstance(stored, dict) and stored.get("kind") == _KIND and stored.get("model") == model:
+        if not isinstance(stored, dict) or stored.get("kind") != _KIND:
+            fix = "move it: presets of this model are kept under this name"
+            raise DataError.of(path, "kind", expected=f"'{_KIND}'", found="a file of another program", fix=fix)
+        if stored.get("model") == model:
             check_form(stored, _FORM, path)
             measured = [e for e in stored["measured"] if (e["device"], e["size"]) != (device, list(size))]
     entry = {

@@ -87,3 +87,15 @@ def test_defects_of_ours_keep_their_traceback(monkeypatch, defect):
     monkeypatch.setattr(doctor, "main", fail)
     with pytest.raises(type(defect)):
         cli.main(["doctor"])
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_an_input_is_not_replaced_by_a_result(tmp_path, capsys, link):
+    given, out = tmp_path / "t.npz", tmp_path / "t.npz"
+    given.write_bytes(b"meshes")
+    if link:
+        out = tmp_path / "other.npz"
+        out.symlink_to(given)
+    assert cli.main(["spectral", "--meshes", str(given), "--out", str(out)]) == 2
+    assert "expected a file to write, found the input of --meshes" in capsys.readouterr().err
+    assert given.read_bytes() == b"meshes"

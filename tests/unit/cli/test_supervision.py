@@ -221,3 +221,17 @@ def test_a_number_that_is_used_again_is_another_process(tmp_path, monkeypatch):
     (state / "nbavatar-run.json").write_text(json.dumps(record))
     assert supervision.run_workflow([sys.executable, "-c", "raise SystemExit(7)"]) == 7
     assert not (state / "locks").exists()
+
+
+def test_a_lock_that_is_younger_than_the_run_is_another_s(start, tmp_path):
+    """Of a plain snakemake in another container, that sees the same disk."""
+    run = start()
+    processes = at_work(tmp_path)
+    os.kill(processes[0], signal.SIGKILL)
+    run.communicate(timeout=PATIENCE_S)
+    record = tmp_path / ".snakemake/nbavatar-run.json"
+    os.utime(record, (1e9, 1e9))
+    again = start("--again")
+    _, error = again.communicate(timeout=PATIENCE_S)
+    assert again.returncode == 1 and "found one whose run is not known" in error
+    assert len(list((tmp_path / ".snakemake/locks").iterdir())) == 2

@@ -1,9 +1,10 @@
 import json
 import math
+from pathlib import Path
 
 import pytest
 
-from nbavatar.config.sheets import capture_subjects, read_rows, read_subjects
+from nbavatar.config.sheets import Subject, capture_subjects, read_rows, read_subjects, refuse_namesakes
 from nbavatar.errors import ConfigError
 
 HEADER = "subject\ttrain_cameras\ttest_camera\n"
@@ -106,3 +107,16 @@ def test_sheets_and_cameras_may_begin_with_a_byte_order_mark(tmp_path):
     path = tmp_path / "demo/cameras.json"
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert capture_subjects(str(tmp_path / "demo"), "a")["demo"].train_cameras == ("b",)
+
+
+def test_results_of_another_capture_of_that_name_are_not_replaced(tmp_path):
+    here, there = (Subject("demo", ("a",), "", str(tmp_path / day / "demo")) for day in ("monday", "tuesday"))
+    record = tmp_path / "check" / "demo" / "record.json"
+    for folder in (here.root, there.root, record.parent):
+        Path(folder).mkdir(parents=True)
+    record.write_text(json.dumps({"folder": here.root}))
+    refuse_namesakes({"demo": here}, tmp_path / "check")
+    with pytest.raises(ConfigError, match=r"'demo', of which there are results; they were made of .*monday/demo"):
+        refuse_namesakes({"demo": there}, tmp_path / "check")
+    Path(here.root).rmdir()  # moved
+    refuse_namesakes({"demo": there}, tmp_path / "check")

@@ -22,6 +22,7 @@ def test_a_file_of_windows_is_read(tmp_path):
         (b"when: 2024-13-45\n", "text that does not parse .*month"),
         (b"a: [" * 3000, "text that does not parse .*nested too deeply"),
         (b"a: !!python/object/apply:os.system ['true']\n", "text that does not parse"),
+        (b"steps: 1" + b":59" * 1000, "a number of 3001 characters"),  # to the base of 60, in quadratic time
         (b"? [a]\n: b\n", "text that does not parse .*unhashable"),
         (b"".join(b"k%d: &k%d [*k%d, *k%d]\n" % (i, i, i - 1, i - 1) if i else b"k0: &k0 [1]\n" for i in range(50)),
          "refer to one another without end"),

@@ -95,6 +95,7 @@ def test_cuts_divide_runs(capture):
         # Minutes, where every frame was looked for in all before it.
         (lambda s: s.update(frames=[f"t{i}" for i in range(200_000)] + ["t7"]), "each frame once, found 't7' twice"),
         (lambda s: s.update(frames=["../t1"]), "a name of letters"),
+        (lambda s: s.update(frames=["t1", "topology"]), "other names than 'topology'"),
         (lambda s: s.update(cuts=["t1"]), "pairs of frame ids"),
         (lambda s: s.update(cuts=[["1", "2"]]), "cuts: expected pairs of ids that are in frames, found '1'"),
         (lambda s: s.update(cuts=[["t2", "t1"]]), "cut 0: expected .* found .2, 1."),

@@ -148,3 +148,36 @@ def test_frame_pack_of_another_format_or_damaged_is_refused(tmp_path):
     (tmp_path / "b.zip").write_bytes(b"nothing")
     with pytest.raises(DataError, match="damaged"):
         FramePack(tmp_path / "b.zip")
+
+
+@pytest.mark.parametrize("size", [30_000, 3])
+def test_a_frame_pack_is_as_large_as_its_pictures(tmp_path, size):
+    """Renders are as large as the pack says: gigabytes of nothing, for a file of a few bytes."""
+    manifest = {
+        "stage": "crop", "subject": "toy", "camera": "c", "width": 4, "height": 4, "K": np.eye(3).tolist(),
+        "cam_from_world": np.eye(4).tolist(), "frames": ["f0"], "layers": {"rgb": ""},
+    }  # fmt: skip
+    with FramePackWriter(tmp_path / "p.zip", manifest) as writer:
+        writer.add("rgb", "f0", np.zeros((4, 4, 3), np.uint8))
+    FramePack(tmp_path / "p.zip").close()
+    with zipfile.ZipFile(tmp_path / "p.zip") as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    stored = json.loads(entries["manifest.json"]) | {"width": size, "height": size}
+    with zipfile.ZipFile(tmp_path / "p.zip", "w") as archive:
+        for name, content in (entries | {"manifest.json": json.dumps(stored)}).items():
+            archive.writestr(name, content)
+    with pytest.raises(DataError, match=rf"rgb/f0\.png: expected {size} x {size} as in the manifest, found 4 x 4"):
+        FramePack(tmp_path / "p.zip")
+
+
+@pytest.mark.parametrize("kind", ["a pipe", "a device"])
+def test_what_has_no_end_is_not_read(tmp_path, kind):
+    """Archives carry pipes and links."""
+    path = tmp_path / "a"
+    if kind == "a pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    for read in (read_json, read_arrays, FramePack):
+        with pytest.raises(DataError, match=f"found {kind}.*, which is never read"):
+            read(path)
