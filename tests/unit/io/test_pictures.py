@@ -139,7 +139,7 @@ def test_a_picture_that_ends_early_is_named(tmp_path, colours, kind):
 
 def test_sizes_are_bounded_before_anything_is_decoded(tmp_path, monkeypatch, colours):
     Image.fromarray(colours).save(tmp_path / "a.png")
-    monkeypatch.setattr(pictures, "_MOST_PIXELS", 53)
+    monkeypatch.setattr(pictures, "MOST_PIXELS", 53)
     monkeypatch.setattr(Image.Image, "convert", None)
     with pytest.raises(DataError, match="size: expected at most 53 pixels, found 9 x 6"):
         read_colours(tmp_path / "a.png")
