@@ -106,11 +106,12 @@ rule all:
     input: expand("{how}/model.pt", how=["whole", "time", "memory"])
 
 rule train:
+    input: lambda wildcards: [] if wildcards.how == "whole" else "whole/model.pt"  # after it, kernels are compiled
     output: "{how}/model.pt"
     retries: 2
     resources:
         mem="2GB",
-        runtime=lambda wildcards, attempt: 1 if wildcards.how == "time" and attempt == 1 else 30,
+        runtime=lambda wildcards, attempt: 2 if wildcards.how == "time" and attempt == 1 else 30,
     shell: "{PYTHON} stop.py {wildcards.how} {wildcards.how} {TRAIN} --out {output} >> attempts.{wildcards.how} 2>&1"
 """
 OPTIONS = train_options({
@@ -144,7 +145,8 @@ def test_a_training_that_the_scheduler_ends_goes_on_to_the_same_weights(tmp_path
     said = done.stdout + done.stderr
     assert done.returncode == 0, said[-6000:]
     ends = sorted(line.split()[0] for line in jobs.decode().splitlines() if line.endswith(str(tmp_path)))
-    assert ends.count("COMPLETED") == 3 and "TIMEOUT" in ends and len(ends) == 5, ends
+    # What is ended for its memory is a step, which is tried again in its own job.
+    assert ends.count("COMPLETED") == 3 and "TIMEOUT" in ends, ends
     whole = weights(read_tensors(tmp_path / "whole/model.pt", "an avatar"))
     assert whole
     for how in ("time", "memory"):
