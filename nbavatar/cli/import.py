@@ -55,6 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--repair", action="store_true", help="mend the faces of mesh files (winding, doubles)")
     parser.add_argument(
+        "--max-faces", type=_faces, metavar="N", help="make mesh files with more faces a part coarser (pymeshlab)"
+    )
+    parser.add_argument(
         "--pixel-center", type=float, choices=(0.0, 0.5), default=0.5,
         help="where SRC puts the centre of pixel (0, 0) [px]: 0.5, or 0 as OpenCV's calibration does",
     )  # fmt: skip
@@ -70,7 +73,7 @@ def main(args: argparse.Namespace) -> None:
     mesh_scale = args.scale if args.mesh_scale is None else args.mesh_scale
     _refuse_idle(args)
     if args.format == "meshes":
-        files = open_meshes(root, scale=mesh_scale, repair=args.repair)
+        files = open_meshes(root, scale=mesh_scale, repair=args.repair, max_faces=args.max_faces)
         frames = {frame: frame for frame in read_splits(out).frames}
         write_meshes(files, out, frames, progress=progress)
         _say(files.notes, f"{out / 'meshes'}: {len(frames)} frames of {', '.join(files.topology())}")
@@ -79,7 +82,7 @@ def main(args: argparse.Namespace) -> None:
     if args.images or args.masks:
         source = with_recordings(source, _folder(args.images), _folder(args.masks))
     if args.meshes:
-        files = open_meshes(Path(args.meshes), scale=mesh_scale, repair=args.repair)
+        files = open_meshes(Path(args.meshes), scale=mesh_scale, repair=args.repair, max_faces=args.max_faces)
         source.notes.extend(files.notes)
         source.meshes = files if source.meshes is None else JoinedMeshes([source.meshes, files])
     options = {key: value for key, value in vars(args).items() if key not in ("source", "out")}
@@ -115,6 +118,16 @@ def _refuse_idle(args: argparse.Namespace) -> None:
     for name in idle:
         if getattr(args, name) != (1.0 if name == "scale" else None) and getattr(args, name):
             raise ConfigError.of(f"--{name}", expected=f"an option of another format than {args.format}", found="it")
+
+    if args.max_faces is not None and args.format != "meshes" and not args.meshes:
+        raise ConfigError.of("--max-faces", expected="mesh files, by --meshes", found="none")
+
+
+def _faces(text: str) -> int:
+    value = int(text)
+    if value < 4:
+        raise argparse.ArgumentTypeError(f"expected 4 faces or more, found {text}")
+    return value
 
 
 def _folder(text: str | None) -> Path | None:

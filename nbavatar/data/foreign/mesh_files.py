@@ -14,6 +14,8 @@ from nbavatar.data.foreign.source import Meshes, natural
 from nbavatar.data.sequences import PARTS, read_sequence
 from nbavatar.errors import DataError
 from nbavatar.io.meshfiles import MESH_TYPES, read_mesh_file
+from nbavatar.mesh.bvh import surface_points
+from nbavatar.mesh.decimation import decimate_mesh
 from nbavatar.mesh.repair import repair_faces
 
 __all__ = ["FrameFiles", "JoinedMeshes", "MeshFiles", "SequenceMeshes", "find_mesh_files", "open_meshes"]
@@ -41,6 +43,8 @@ class MeshFiles:
         rest: part -> file of the part at rest.
         scale: metres per unit of the files.
         repair: mend the faces of the first frame (see `repair_faces`), for all frames alike.
+        max_faces: faces of a part; a mesh with more is made coarser in its first frame (see `decimate_mesh`), and the
+            coarse vertices ride on the surface of all frames.
 
     Raises:
         DataError: a file is damaged, or its faces are not those of the part's first frame.
@@ -48,7 +52,7 @@ class MeshFiles:
 
     def __init__(
         self, files: Mapping[str, Mapping[str, Path]], *, rest: Mapping[str, Path] | None = None, scale: float = 1.0,
-        repair: bool = False,
+        repair: bool = False, max_faces: int | None = None,
     ) -> None:  # fmt: skip
         self._files, self._scale = {part: dict(frames) for part, frames in files.items()}, scale
         self._by_frame = {part: FrameFiles(frames) for part, frames in self._files.items()}
@@ -56,6 +60,8 @@ class MeshFiles:
         self._stored: dict[str, np.ndarray] = {}  # faces as they are in the files
         self._faces: dict[str, np.ndarray] = {}
         self._counts: dict[str, int] = {}
+        # Faces before they were made fewer, and where on them the vertices that were kept ride.
+        self._rides: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         self.notes: list[str] = []
         for part, frames in self._files.items():
             first = next(iter(frames.values()))
@@ -65,6 +71,14 @@ class MeshFiles:
             if repair:
                 self._faces[part], said = repair_faces(verts, faces)
                 self.notes.extend(f"{first}: {line}" for line in said)
+            if max_faces is not None and len(self._faces[part]) > max_faces:
+                fine, coarse = self._faces[part], decimate_mesh(verts, self._faces[part], max_faces)
+                if not len(coarse.faces) or (coarse.face < 0).any():
+                    raise DataError.of(
+                        first, expected="a surface that fewer faces can have", found="one that collapses"
+                    )
+                self._rides[part], self._faces[part] = (fine, coarse.face, coarse.weight), coarse.faces
+                self.notes.append(f"{first}: {len(fine)} faces made {len(coarse.faces)}, for all frames alike")
             path = (rest or {}).get(part)
             self._rest[part] = None if path is None else self._read(part, path)
 
@@ -91,7 +105,7 @@ class MeshFiles:
                 path, "faces", expected=f"those of {first}, in their order", found="others",
                 fix="all frames need one topology; remesh none of them on its own",
             )  # fmt: skip
-        return verts * self._scale
+        return (surface_points(verts, *self._rides[part]) if part in self._rides else verts) * self._scale
 
 
 class JoinedMeshes:
@@ -133,12 +147,20 @@ class SequenceMeshes:
         return {name: values for name, values in verts.items() if np.isfinite(values).all()}
 
 
-def open_meshes(path: Path, *, scale: float = 1.0, repair: bool = False) -> MeshFiles | SequenceMeshes:
+def open_meshes(
+    path: Path, *, scale: float = 1.0, repair: bool = False, max_faces: int | None = None
+) -> MeshFiles | SequenceMeshes:
     """The meshes of a folder of files (`find_mesh_files`), or of a mesh sequence (.npz), which is in metres already."""
-    return SequenceMeshes(path) if path.is_file() else find_mesh_files(path, scale=scale, repair=repair)
+    if path.is_file():
+        if max_faces is not None:
+            raise DataError.of(path, expected="a folder of mesh files, where faces are to be fewer", found="a file")
+        return SequenceMeshes(path)
+    return find_mesh_files(path, scale=scale, repair=repair, max_faces=max_faces)
 
 
-def find_mesh_files(folder: Path, *, scale: float = 1.0, repair: bool = False) -> MeshFiles:
+def find_mesh_files(
+    folder: Path, *, scale: float = 1.0, repair: bool = False, max_faces: int | None = None
+) -> MeshFiles:
     """The sequences of a folder; see the module for its layout.
 
     Raises:
@@ -158,7 +180,7 @@ def find_mesh_files(folder: Path, *, scale: float = 1.0, repair: bool = False) -
         raise DataError.of(
             folder, expected=f"<frame>{' or <frame>'.join(MESH_TYPES)}, here or in {', '.join(PARTS)}", found="none"
         )
-    return MeshFiles(files, rest=rest, scale=scale, repair=repair)
+    return MeshFiles(files, rest=rest, scale=scale, repair=repair, max_faces=max_faces)
 
 
 def _listed(folder: Path) -> dict[str, Path]:

@@ -22,6 +22,7 @@ from nbavatar.config.tradeoff import OfflineConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.errors import DataError, require
 from nbavatar.mesh.bvh import DeformingMesh, surface_points
+from nbavatar.mesh.decimation import decimate_mesh
 from nbavatar.studies.tradeoff.contact import ContactScene, contact_scene
 
 __all__ = ["contact_rows", "decimate", "decimation_rows", "refit_rows", "spectral_rows"]
@@ -145,33 +146,15 @@ def decimate(sequence: MeshSequence, share: float) -> MeshSequence:
     parts = {}
     for name, part in sequence.parts.items():
         rest = np.asarray(part.rest, np.float64)
-        verts, faces = _collapse(rest, part.faces, max(4, round(share * len(part.faces))))
+        verts, faces, face, weight = decimate_mesh(rest, part.faces, max(4, round(share * len(part.faces))))
         if not len(faces):
             raise DataError.of("decimate", name, expected="at least one face", found="none", fix="keep a larger share")
-        original = DeformingMesh(rest, part.faces)
-        face, weight, _ = _closest(original, verts)
         posed = [
             surface_points(np.asarray(points, np.float64), part.faces, face, weight).astype(np.float32)
             for points in part.verts
         ]
         parts[name] = Part(faces, verts.astype(np.float32), np.stack(posed))
     return MeshSequence(list(sequence.frames), parts, {})
-
-
-def _collapse(verts: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of about `count` faces by quadric edge collapse, borders kept."""
-    import pymeshlab
-
-    meshes = pymeshlab.MeshSet()
-    # Millimetres: the filter's own thresholds are absolute.
-    meshes.add_mesh(pymeshlab.Mesh(1e3 * verts, np.asarray(faces, np.int32)))
-    if count < len(faces):
-        meshes.meshing_decimation_quadric_edge_collapse(
-            targetfacenum=count, preserveboundary=True, preservenormal=True, optimalplacement=True
-        )
-    meshes.meshing_remove_unreferenced_vertices()
-    mesh = meshes.current_mesh()
-    return 1e-3 * mesh.vertex_matrix(), np.asarray(mesh.face_matrix(), np.int64)
 
 
 def _closest(mesh: DeformingMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

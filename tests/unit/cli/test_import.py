@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import project
@@ -10,6 +11,7 @@ from nbavatar.cli import main
 from nbavatar.config.sheets import capture_subjects
 from nbavatar.data.capture import open_capture, read_mesh, read_splits, read_topology
 from nbavatar.data.foreign.flame_parameters import FlameSequence
+from nbavatar.data.foreign.mesh_files import open_meshes
 from nbavatar.io.meshfiles import read_mesh_file
 from tests.scenes import foreign
 
@@ -212,6 +214,27 @@ def test_inside_out_meshes_are_repaired_where_asked(tmp_path, capfd):
     assert "4 repeated faces dropped" in said and "1 faces with a vertex twice dropped" in said
     assert f"{len(faces)} faces turned outwards" in said
     assert_checks(tmp_path / "me")
+
+
+def test_dense_meshes_are_made_coarser_where_asked(tmp_path, capfd):
+    # A ball of 25 cm in millimetres that turns, grows and moves: coarse vertices follow an affine motion exactly.
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=125.0)
+    motions = [(1.0, 0.0, [0, 0, 0]), (1.02, 0.4, [3.0, -40, 9]), (0.98, -1.0, [500.0, 2, 1])]
+    posed = []
+    for i, (scale, angle, shift) in enumerate(motions):
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        posed.append((scale * turn, np.array(shift)))
+        foreign.write_obj(tmp_path / "meshes" / f"{i}.obj", ball.vertices @ (scale * turn).T + shift, ball.faces)
+    files = open_meshes(tmp_path / "meshes", scale=0.001, max_faces=400)
+    faces = files.topology()["head"][0]
+    assert 300 < len(faces) <= 400 and "5120 faces made" in files.notes[0]
+    first = files.vertices("0")["head"]
+    assert trimesh.Trimesh(first, faces, process=False).is_watertight and len(np.unique(faces)) == len(first)
+    np.testing.assert_allclose(np.linalg.norm(first, axis=1), 0.125, rtol=3e-3)
+    for i, (linear, shift) in enumerate(posed):
+        np.testing.assert_allclose(files.vertices(str(i))["head"], first @ linear.T + 0.001 * shift, atol=1e-9)
+    assert run("nerfstudio", foreign.write_nerfstudio(tmp_path / "ns"), tmp_path / "me", "--max-faces", 400) == 2
+    assert errors(capfd)[0].endswith("--max-faces: expected mesh files, by --meshes, found none")
 
 
 def test_pycolmap_reads_the_same(tmp_path):
