@@ -27,21 +27,35 @@ container: "docker://ghcr.io/nbavatar/nbavatar:0.1.0"
 
 
 include: "workflow/rules/common.smk"
-
-
-# `all` comes first, so that it is what `snakemake` without a target makes.
-rule all:
-    default_target: True
-    input:
-        EVERYTHING,
-
-
 include: "workflow/rules/ingest.smk"
 include: "workflow/rules/masks.smk"
 include: "workflow/rules/geometry.smk"
 include: "workflow/rules/train.smk"
 include: "workflow/rules/evaluate.smk"
-include: "workflow/rules/tables.smk"
 include: "workflow/rules/figures.smk"
 include: "workflow/rules/tradeoff.smk"
+include: "workflow/rules/tables.smk"
 include: "workflow/rules/targets.smk"
+
+
+# What `snakemake` without a target makes. It comes last, because it names outputs of the other rules, and stands in this
+# file, because Snakemake takes no default target from an included one.
+rule all:
+    default_target: True
+    input:
+        (
+            rules.compare.output
+            if PLAN.compares
+            else [
+                *files(rules.video.output.video, units.videos(PLAN)),
+                *sweeps(RUN.tradeoff.variants, RUN.tradeoff.also),
+                *expand(
+                    rules.extremes.output.table, run=[RUN.run] if RUN.extremes else []
+                ),
+                *files(rules.figure.output.png, units.figures(PLAN)),
+                *files(rules.evaluate.output.record, PLAN.rows),
+                *expand(rules.collect.output, run=RUN.run),
+                *files(TABLES, units.tables(PLAN)),
+                *expand(rules.report.output, run=RUN.run),
+            ]
+        ),

@@ -36,6 +36,20 @@ done
 """
 
 
+ALL = -1  # of a rule: as many jobs as a run from nothing has
+
+
+def counted(expected: dict[str, int], whole: dict[str, int]) -> dict[str, int]:
+    """A plan in which `ALL` is replaced by the numbers of a plan from nothing."""
+    return {rule: whole[rule] if count == ALL else count for rule, count in expected.items()}
+
+
+def difference(before: dict[str, int], after: dict[str, int]) -> dict[str, int]:
+    """Rule -> how many more jobs the second plan has; rules with as many are left out."""
+    more = {rule: after.get(rule, 0) - before.get(rule, 0) for rule in {**before, **after}}
+    return {rule: count for rule, count in more.items() if count}
+
+
 class Project:
     """A project folder and ways to plan and run its workflow."""
 

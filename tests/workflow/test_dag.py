@@ -1,5 +1,6 @@
 """What the workflow plans, from nothing."""
 
+import csv
 import json
 import re
 import subprocess
@@ -9,26 +10,62 @@ import pytest
 import yaml
 
 from tests.scenes.capture import write_capture
+from tests.workflow.conftest import difference
 
-SMOKE = {
-    "synthesize": 1, "ingest": 4, "tracks": 1, "masks": 4, "crop": 8, "fit": 1, "spectral": 1, "deform": 1,
-    "train": 13, "render": 18, "evaluate": 18, "speed": 7, "table": 8, "report": 1, "collect": 1,
-    "figure": 5, "reenact": 1, "reenact_contact": 1, "video": 2, "tradeoff": 1, "extremes": 1,
-}  # fmt: skip
+
+def _sheet(project, name):
+    with open(project.folder / name, newline="") as stream:
+        return list(csv.DictReader(stream, delimiter="\t"))
+
+
+def _counted(project, rows, subjects, crops):
+    """Jobs of each unit of work, by the sheets alone."""
+    rows, cameras = _sheet(project, rows), {s["subject"]: s["train_cameras"] for s in _sheet(project, subjects)}
+    made = {row["subject"] for row in rows}
+    views = sum(1 + len(cameras[name].split(",")) for name in made)
+    trained = {(row["subject"], row["variant"]) for row in rows}
+    return {
+        **dict.fromkeys(("tracks", "fit", "spectral", "deform"), len(made)),
+        **{"ingest": views, "masks": views, "crop": crops * views},
+        **{"train": len(trained), "render": len(rows), "evaluate": len(rows)},
+        **dict.fromkeys(("report", "collect", "extremes", "tradeoff"), 1),
+    }
+
+
+def _named(project, name):
+    return yaml.safe_load((project.folder / name).read_text())
 
 
 def test_default_target_is_everything_and_not_nothing(project):
-    assert project.plan() == SMOKE
+    plan = project.plan()
+    config = _named(project, "config/smoke.yaml")
+    counted = _counted(project, config["runs"], config["subjects"], len(config["crops"]))
+    counted |= {"synthesize": 1, "video": 2 * len(config["videos"]), "reenact": 1, "reenact_contact": 1}
+    counted |= {"table": len(_named(project, "config/tables.yaml")), "figure": len(_named(project, config["figures"]))}
+    assert 0 < plan.pop("speed") <= counted["train"]
+    assert plan == counted
+
+
+def test_a_variant_of_one_row_adds_one_training_one_render_one_evaluation(project):
+    config, before = _named(project, "config/smoke.yaml"), project.plan()
+    path = project.folder / config["runs"]
+    sheet = path.read_text()
+    (project.folder / "config/more.yaml").write_text(yaml.safe_dump({"variants": {"new": {"meshes": "fit"}}}))
+    path.write_text(sheet + "S2\tnew\tsr1024\n")
+    after = project.plan(config="config/smoke.yaml config/more.yaml")
+    path.write_text(sheet)
+    assert difference(before, after) == {"train": 1, "render": 1, "evaluate": 1}
 
 
 def test_one_subject_one_table_one_stage_can_be_asked_for(project):
-    subject = project.plan("subject_S2")
+    subject, whole = project.plan("subject_S2"), project.plan()
     assert subject.pop("subject_S2") == 1
     shown = {"speed", "table", "collect", "report", "figure", "reenact", "reenact_contact", "video", "tradeoff"}
-    assert subject == {name: count for name, count in SMOKE.items() if name not in shown | {"extremes"}}
+    assert subject == {name: count for name, count in whole.items() if name not in shown | {"extremes"}}
     table = project.plan("table_ablation")
     assert table["table"] == 1
-    assert table["train"] == 6  # full, no_nb, no_reg, no_dnr, no_pbd, no_spectral
+    rows = _named(project, "config/tables.yaml")["ablation"]["rows"]
+    assert table["train"] == len({row["variant"] for row in rows if row.get("variant")})
     assert "speed" not in table
     stage = project.plan("stage_masks")
     assert {"masks", "ingest", "tracks"} < set(stage)
@@ -62,12 +99,16 @@ def _decaf(project, subjects=("S1", "S2", "S3", "S4")):
 def test_the_whole_paper_is_planned(project):
     _decaf(project)
     plan = project.plan(config="config/paper.yaml")
-    assert plan == {
-        "ingest": 32, "tracks": 4, "masks": 32, "crop": 64, "fit": 4, "spectral": 4, "deform": 4,
-        "train": 28, "render": 48, "evaluate": 48, "speed": 7, "table": 8, "report": 1, "collect": 1,
-        "figure": 10, "reenact": 4, "reenact_contact": 4, "video": 8, "tradeoff": 1, "savings": 1, "offline": 1,
-        "extremes": 1,
-    }  # fmt: skip
+    config = _named(project, "config/paper.yaml")
+    counted = _counted(project, "config/runs.tsv", "config/subjects.tsv", crops=2)
+    pairs, films = len(config["reenact"]), 2 * counted["fit"] * len(config["videos"])
+    counted |= {"reenact": pairs, "reenact_contact": pairs, "video": films, "savings": 1, "offline": 1}
+    counted |= {
+        "table": len(_named(project, "config/tables.yaml")),
+        "figure": len(_named(project, "config/figures.yaml")),
+    }
+    assert 0 < plan.pop("speed") <= counted["train"]
+    assert plan == counted
 
 
 def test_subjects_are_found_in_both_split_folders(project):
@@ -127,8 +168,14 @@ def test_a_single_camera_is_trained_on_and_judged_on_poses_only(project, tmp_pat
 
 def test_methods_are_laid_over_a_capture(project, tmp_path):
     root = f"data_root={write_capture(tmp_path / 'toy')}"
+    alone = project.plan("--config", root, config="config/capture.yaml")
     jobs = project.plan("--config", root, config="config/capture.yaml config/methods.yaml")
-    assert jobs["train"] == 6 and jobs["evaluate"] == 9 and jobs["speed"] == 3 and jobs["table"] == 4
+    rows = _sheet(project, "config/methods/runs.tsv")
+    more = difference(alone, jobs)
+    assert more["train"] == len({row["variant"] for row in rows}) - alone["train"]
+    assert more["render"] == more["evaluate"] == len(rows) - alone["evaluate"]
+    assert not set(more) & {"ingest", "tracks", "masks", "align", "spectral"}
+    assert jobs["table"] == len(_named(project, "config/methods/tables.yaml"))
 
 
 def test_a_comparison_has_avatars_of_its_own(project, tmp_path):

@@ -8,9 +8,9 @@ OUTPUTS: results/{run}/render/..., results/{run}/eval/..., results/{run}/speed/.
 
 rule render:
     input:
-        model="results/{run}/train/{subject}/{variant}/model.pt",
+        model=rules.train.output.model,
         meshes=meshes_of,
-        frames=protocol_frames,
+        frames=lambda w: judged_frames(w.subject, w.protocol),
     output:
         "results/{run}/render/{subject}/{variant}/{protocol}.zip",
     log:
@@ -24,7 +24,7 @@ rule render:
         runtime="4h",
     params:
         device=RUN.device,
-        protocol=protocol_options,
+        protocol=lambda w: parameters.protocol_text(PLAN, w.protocol),
         code=code_of("render"),
     shell:
         "nbavatar render --model {input.model:q} --meshes {input.meshes:q} --frames {input.frames:q}"
@@ -33,9 +33,11 @@ rule render:
 
 rule evaluate:
     input:
-        render="results/{run}/render/{subject}/{variant}/{protocol}.zip",
-        frames=protocol_frames,
-        train=protocol_train_frames,
+        render=rules.render.output[0],
+        frames=lambda w: judged_frames(w.subject, w.protocol),
+        train=lambda w: files(
+            rules.crop.output, units.trivial_answers(PLAN, w.subject, w.protocol)
+        ),
     output:
         record="results/{run}/eval/{subject}/{variant}/{protocol}.json",
         images="results/{run}/eval/{subject}/{variant}/{protocol}.csv",
@@ -46,7 +48,7 @@ rule evaluate:
         mem="16GB",
         runtime="8h",
     params:
-        protocol=protocol_options,
+        protocol=lambda w: parameters.protocol_text(PLAN, w.protocol),
         cfg=options("evaluate"),
         code=code_digest("evaluate"),
     shell:
@@ -59,7 +61,7 @@ rule evaluate:
 # where no number of cores is given, it gets what other GPU jobs get.)
 rule speed:
     input:
-        model="results/{run}/train/{subject}/{variant}/model.pt",
+        model=rules.train.output.model,
         meshes=meshes_of,
         frames=train_frames,
     output:

@@ -9,8 +9,8 @@ OUTPUTS: results/{run}/figures/{figure}.{png,pdf,json}, results/{run}/reenact/{s
 # Poses are exchanged between heads without contact; the contact stage then dents the head that is shown.
 rule reenact:
     input:
-        source=lambda w: fitted_of(w.source),
-        target=lambda w: fitted_of(w.target),
+        source=lambda w: mesh_file(units.fitted(PLAN, w.source)),
+        target=lambda w: mesh_file(units.fitted(PLAN, w.target)),
     output:
         "results/{run}/reenact/{source}/{target}.before.npz",
     log:
@@ -19,12 +19,12 @@ rule reenact:
         mem="8GB",
         runtime="1h",
     params:
-        assets=lambda w: (
-            ["--assets", str(Path(RUN.data_root) / "assets")]
-            if RUN.layout == "decaf"
-            else []
+        assets=([] if PLAN.captured else ["--assets", str(layouts.assets_folder(PLAN))]),
+        given=(
+            ""
+            if PLAN.captured
+            else layouts.data_digest(PLAN, layouts.body_models(PLAN))
         ),
-        given=given_data(assets()) if RUN.layout == "decaf" else "",
         code=code_digest("reenact"),
     shell:
         "nbavatar reenact --source {input.source:q} --target {input.target:q} {params.assets:q}"
@@ -33,7 +33,7 @@ rule reenact:
 
 rule reenact_contact:
     input:
-        "results/{run}/reenact/{source}/{target}.before.npz",
+        rules.reenact.output,
     output:
         "results/{run}/reenact/{source}/{target}.npz",
     log:
@@ -51,7 +51,7 @@ rule reenact_contact:
 
 rule video:
     input:
-        model="results/{run}/train/{subject}/{variant}/model.pt",
+        model=rules.train.output.model,
         meshes=meshes_of,
         camera=lambda w: train_frames(w)[0],
     output:
@@ -82,13 +82,20 @@ rule video:
 rule figure:
     input:
         layout=RUN.figures,
-        renders=lambda w: figure_files(w.figure, "renders"),
-        frames=lambda w: figure_files(w.figure, "frames"),
-        evals=lambda w: figure_files(w.figure, "evals"),
-        speeds=lambda w: figure_files(w.figure, "speeds"),
-        histories=lambda w: figure_files(w.figure, "histories"),
-        models=lambda w: figure_files(w.figure, "models"),
-        sequences=lambda w: figure_files(w.figure, "sequences"),
+        renders=lambda w: files(rules.render.output, shown(PLAN, w.figure).renders),
+        frames=lambda w: sorted(files(rules.crop.output, shown(PLAN, w.figure).frames)),
+        evals=lambda w: files(
+            rules.evaluate.output.record, shown(PLAN, w.figure).evaluations
+        ),
+        speeds=lambda w: files(rules.speed.output, shown(PLAN, w.figure).timings),
+        histories=lambda w: files(
+            rules.train.output.history, shown(PLAN, w.figure).histories
+        ),
+        models=lambda w: files(rules.train.output.model, shown(PLAN, w.figure).models),
+        sequences=lambda w: [
+            *map(mesh_file, shown(PLAN, w.figure).meshes),
+            *files(rules.reenact_contact.output, shown(PLAN, w.figure).reenacted),
+        ],
     output:
         png=report(
             "results/{run}/figures/{figure}.png",
@@ -105,8 +112,8 @@ rule figure:
         runtime="30m",
     params:
         stem=lambda w, output: output.png[:-4],
-        given=given([RUN.figures] if RUN.figures else []),
-        code=figure_code,
+        given=given_digest([RUN.figures] if RUN.figures else []),
+        code=lambda w: parameters.figure_code(PLAN, w.figure),
     shell:
         "nbavatar figure --figure {wildcards.figure:q} --layout {input.layout:q} --renders {input.renders:q}"
         " --frames {input.frames:q} --evals {input.evals:q} --speeds {input.speeds:q} --histories {input.histories:q}"

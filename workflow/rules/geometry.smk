@@ -7,16 +7,15 @@ OUTPUTS: results/{run}/fit/{subject}.{npz,png} or results/{run}/align/{subject}.
 """
 
 # A capture brings final meshes: there is nothing to refit.
-if RUN.layout == "decaf":
+if not PLAN.captured:
 
     rule fit:
         input:
-            tracks="results/{run}/tracks/{subject}.npz",
-            frames=lambda w: [
-                f"{R}/ingest/{w.subject}/{c}.zip"
-                for c in SUBJECTS[w.subject].train_cameras
-            ],
-            assets=assets(),
+            tracks=rules.tracks.output[0],
+            frames=lambda w: files(
+                rules.ingest.output, units.training_views(PLAN, w.subject)
+            ),
+            assets=layouts.body_models(PLAN),
         output:
             meshes="results/{run}/fit/{subject}.npz",
             sheet=report(
@@ -36,8 +35,8 @@ if RUN.layout == "decaf":
             mem="16GB",
             runtime="8h",
         params:
-            assets=Path(RUN.data_root) / "assets",
-            given=given_data(assets()),
+            assets=layouts.assets_folder(PLAN),
+            given=layouts.data_digest(PLAN, layouts.body_models(PLAN)),
             cfg=options("fit"),
             code=code_digest("fit"),
         shell:
@@ -45,15 +44,14 @@ if RUN.layout == "decaf":
             " --out {output.meshes:q} --sheet {output.sheet:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
-if ALIGNED:
+if PLAN.aligned:
 
     rule align:
         input:
-            meshes="results/{run}/tracks/{subject}.npz",
-            frames=lambda w: [
-                f"{R}/ingest/{w.subject}/{c}.zip"
-                for c in SUBJECTS[w.subject].train_cameras
-            ],
+            meshes=rules.tracks.output[0],
+            frames=lambda w: files(
+                rules.ingest.output, units.training_views(PLAN, w.subject)
+            ),
         output:
             "results/{run}/align/{subject}.npz",
         log:
@@ -72,15 +70,14 @@ if ALIGNED:
             " --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
-if SHELLED:
+if PLAN.shelled:
 
     rule shell:
         input:
-            meshes=fitted,
-            masks=lambda w: [
-                f"{R}/masks/{w.subject}/{c}.zip"
-                for c in SUBJECTS[w.subject].train_cameras
-            ],
+            meshes=lambda w: mesh_file(units.fitted(PLAN, w.subject)),
+            masks=lambda w: files(
+                rules.masks.output, units.training_views(PLAN, w.subject)
+            ),
         output:
             meshes="results/{run}/shell/{subject}.npz",
             picture=report(
@@ -107,7 +104,7 @@ if SHELLED:
 
 rule spectral:
     input:
-        whole,
+        lambda w: mesh_file(units.whole(PLAN, w.subject)),
     output:
         meshes="results/{run}/spectral/{subject}.npz",
         picture=report(
@@ -132,7 +129,7 @@ rule spectral:
 
 rule deform:
     input:
-        whole,
+        lambda w: mesh_file(units.whole(PLAN, w.subject)),
     output:
         meshes="results/{run}/deform/{subject}.npz",
         maps="results/{run}/deform/{subject}.exr.zip",

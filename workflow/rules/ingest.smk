@@ -10,26 +10,13 @@ if RUN.synthetic:
     # One job writes the whole dataset; every raw file is one of its outputs.
     rule synthesize:
         output:
-            [
-                str(path)
-                for s in SUBJECTS
-                for path in dict.fromkeys(
-                    [
-                        *raw_tracks(SimpleNamespace(subject=s)),
-                        *(
-                            path
-                            for c in SUBJECTS[s].cameras
-                            for path in raw_files(SimpleNamespace(subject=s, camera=c))
-                        ),
-                    ]
-                )
-            ],
+            layouts.dataset(PLAN),
         log:
             f"logs/{RUN.run}/synthesize.log",
         params:
             cfg=options("synthesize"),
             code=code_digest("synthesize"),
-            root=data_root,
+            root=RUN.data_root,
         shell:
             "nbavatar synthesize --out {params.root:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
@@ -38,7 +25,7 @@ if RUN.synthetic:
 # again because a capture has been checked again. What `check` depends on is therefore no input or parameter of it
 # (Snakemake would then not look for other changes behind it), but of `check_sheet`, which asks for a picture that only
 # a new check makes. That the record stays when a check fails leaves what follows as it is, too.
-if RUN.layout == "capture":
+if PLAN.captured:
 
     rule check:
         output:
@@ -50,7 +37,7 @@ if RUN.layout == "capture":
         resources:
             mem="8GB",
             runtime="4h",
-            root=root,
+            root=lambda w: PLAN.subjects[w.subject].root,
             supplied=f"--supplied={RUN.stages.masks.supplied}",
             center=f"--pixel-center={RUN.frames.pixel_center}",
             cfg=options("check"),
@@ -61,7 +48,7 @@ if RUN.layout == "capture":
 
     rule check_sheet:
         input:
-            "results/{run}/check/{subject}/checked.png",
+            rules.check.output.picture,
         output:
             report(
                 "results/{run}/check/{subject}/overview.png",
@@ -75,10 +62,10 @@ if RUN.layout == "capture":
             mem="1GB",
             runtime="10m",
         params:
-            root=root,
+            root=lambda w: PLAN.subjects[w.subject].root,
             supplied=RUN.stages.masks.supplied,
             center=RUN.frames.pixel_center,
-            files=files_of_capture,
+            files=lambda w: layouts.capture_digests(PLAN, w.subject),
             cfg=options("check"),
             code=code_digest("check"),
         shell:
@@ -87,7 +74,7 @@ if RUN.layout == "capture":
 
 rule ingest:
     input:
-        raw_files,
+        lambda w: layouts.camera_files(PLAN, w.subject, w.camera),
         checked,
     output:
         "results/{run}/ingest/{subject}/{camera}.zip",
@@ -97,11 +84,13 @@ rule ingest:
         mem="4GB",
         runtime="4h",
     params:
-        root=root,
+        root=lambda w: PLAN.subjects[w.subject].root,
         layout=RUN.layout,
-        files=files_of_images,
-        given=given_data(raw_files),
-        only="--images-only" if RUN.layout == "capture" else "",
+        files=lambda w: layouts.image_digest(PLAN, w.subject, w.camera),
+        given=lambda w: layouts.data_digest(
+            PLAN, layouts.camera_files(PLAN, w.subject, w.camera)
+        ),
+        only="--images-only" if PLAN.captured else "",
         cfg=options("ingest"),
         code=code_digest("ingest"),
     shell:
@@ -111,7 +100,7 @@ rule ingest:
 
 rule tracks:
     input:
-        raw_tracks,
+        lambda w: layouts.track_files(PLAN, w.subject),
         checked,
     output:
         "results/{run}/tracks/{subject}.npz",
@@ -121,11 +110,11 @@ rule tracks:
         mem="8GB",
         runtime="1h",
     params:
-        root=root,
+        root=lambda w: PLAN.subjects[w.subject].root,
         layout=RUN.layout,
-        cameras=cameras,
-        files=files_of_meshes,
-        given=given_data(raw_tracks),
+        cameras=lambda w: PLAN.subjects[w.subject].cameras,
+        files=lambda w: layouts.meshes_digest(PLAN, w.subject),
+        given=lambda w: layouts.data_digest(PLAN, layouts.track_files(PLAN, w.subject)),
         cfg=options("tracks"),
         code=code_digest("tracks"),
     shell:

@@ -8,8 +8,8 @@ OUTPUTS: results/{run}/masks/{subject}/{camera}.zip, results/{run}/crop/{crop}/{
 rule masks:
     input:
         checked,
-        frames="results/{run}/ingest/{subject}/{camera}.zip",
-        meshes="results/{run}/tracks/{subject}.npz",
+        frames=rules.ingest.output[0],
+        meshes=rules.tracks.output[0],
     output:
         "results/{run}/masks/{subject}/{camera}.zip",
     log:
@@ -18,8 +18,10 @@ rule masks:
         mem="8GB",
         runtime="4h",
     params:
-        files=files_of_masks,
-        capture=lambda w: ["--capture", root(w)] if RUN.layout == "capture" else [],
+        files=lambda w: layouts.mask_digest(PLAN, w.subject, w.camera),
+        capture=lambda w: (
+            ["--capture", PLAN.subjects[w.subject].root] if PLAN.captured else []
+        ),
         cfg=options("masks"),
         code=code_digest("masks"),
     shell:
@@ -29,9 +31,9 @@ rule masks:
 
 rule crop:
     input:
-        frames="results/{run}/ingest/{subject}/{camera}.zip",
-        masks="results/{run}/masks/{subject}/{camera}.zip",
-        meshes="results/{run}/tracks/{subject}.npz",
+        frames=rules.ingest.output[0],
+        masks=rules.masks.output[0],
+        meshes=rules.tracks.output[0],
     output:
         "results/{run}/crop/{crop}/{subject}/{camera}.zip",
     log:
@@ -40,7 +42,7 @@ rule crop:
         mem="4GB",
         runtime="2h",
     params:
-        cfg=crop_options,
+        cfg=lambda w: parameters.crop_text(PLAN, w.crop),
         code=code_digest("crop"),
     shell:
         "nbavatar crop --frames {input.frames:q} --masks {input.masks:q} --meshes {input.meshes:q} --out {output:q}"

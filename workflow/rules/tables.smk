@@ -8,8 +8,8 @@ OUTPUTS: results/{run}/results.csv, results/{run}/tables/{table}.{csv,md,tex,htm
 # Every number of the run, image by image; nbavatar/reporting/results.py tells its columns and how a notebook opens it.
 rule collect:
     input:
-        evals=evals_of(ROWS),
-        speeds=sorted({path for table in TABLES for path in speeds_of(table)}),
+        evals=files(rules.evaluate.output.record, PLAN.rows),
+        speeds=sorted(files(rules.speed.output, units.timed(PLAN))),
     output:
         "results/{run}/results.csv",
     log:
@@ -29,8 +29,10 @@ rule table:
     input:
         layout=RUN.tables,
         reported=RUN.reported,
-        evals=lambda w: evals_of(rows_of(w.table)),
-        speeds=lambda w: speeds_of(w.table),
+        evals=lambda w: files(
+            rules.evaluate.output.record, units.rows_of_table(PLAN, w.table)
+        ),
+        speeds=lambda w: files(rules.speed.output, units.timed_in_table(PLAN, w.table)),
     output:
         csv="results/{run}/tables/{table}.csv",
         md="results/{run}/tables/{table}.md",
@@ -48,7 +50,7 @@ rule table:
         runtime="10m",
     params:
         stem=lambda w, output: output.csv[:-4],
-        given=given([RUN.tables, RUN.reported]),
+        given=given_digest([RUN.tables, RUN.reported]),
         label=RUN.size_label,
         cfg=options("table"),
         code=code_digest("table"),
@@ -60,21 +62,44 @@ rule table:
 
 rule report:
     input:
-        tables=[
-            f"{R}/tables/{table}.{suffix}"
-            for table in TABLES
-            for suffix in ("md", "csv")
+        tables=files(
+            [rules.table.output.md, rules.table.output.csv], units.tables(PLAN)
+        ),
+        contact=(
+            files(rules.deform.output.table, units.people(PLAN))
+            if PLAN.solves_contact
+            else []
+        ),
+        evals=files(rules.evaluate.output.record, PLAN.rows),
+        speeds=sorted(files(rules.speed.output, units.timed(PLAN))),
+        renders=files(rules.render.output, PLAN.rows),
+        frames=sorted(files(rules.crop.output, units.judged_crops(PLAN))),
+        histories=files(rules.train.output.history, units.avatars(PLAN)),
+        pictures=[
+            *files(rules.figure.output.png, units.figures(PLAN)),
+            *looked_at(units.people(PLAN)),
+            *(
+                []
+                if PLAN.captured
+                else files(rules.fit.output.sheet, units.people(PLAN))
+            ),
+            *(
+                files(rules.shell.output.picture, units.people(PLAN))
+                if PLAN.shelled
+                else []
+            ),
+            *files(rules.spectral.output.picture, units.people(PLAN)),
+            *(
+                files(rules.deform.output.picture, units.people(PLAN))
+                if PLAN.solves_contact
+                else []
+            ),
         ],
-        contact=contact_tables(),
-        evals=evals_of(ROWS),
-        speeds=sorted({path for table in TABLES for path in speeds_of(table)}),
-        renders=renders_of(ROWS),
-        frames=sorted({path for row in ROWS for path in protocol_frames(row)}),
-        histories=[f"{R}/train/{s}/{v}/history.jsonl" for s, v in avatars()],
-        pictures=report_pictures(),
-        videos=videos(),
-        tradeoffs=TRADEOFFS,
-        extremes=[f"{R}/extremes/record.json"] if RUN.extremes else [],
+        videos=files(rules.video.output.video, units.videos(PLAN)),
+        tradeoffs=sweeps(RUN.tradeoff.variants, RUN.tradeoff.also),
+        extremes=expand(
+            rules.extremes.output.record, run=[RUN.run] if RUN.extremes else []
+        ),
     output:
         report(
             "results/{run}/report/index.html",
@@ -99,22 +124,23 @@ rule report:
         " --out {output:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
-if COMPARED:
+if PLAN.compares:
 
     # Figures of all avatars of a comparison. By hand, `nbavatar compare` draws what there is so far.
     rule compare:
         input:
-            evals_of(ROWS),
+            files(rules.evaluate.output.record, PLAN.rows),
         output:
-            COMPARISON,
+            expand("results/{run}/compare/compare.{s}", run=RUN.run, s=("md", "csv")),
+            files("results/{run}/compare/{subject}_{protocol}.png", units.judged(PLAN)),
         log:
             "logs/{run}/compare.log".format(run=RUN.run),
         resources:
             mem="2GB",
             runtime="10m",
         params:
-            folder=f"{R}/compare",
-            cfg=json.dumps(to_mapping(RUN.compare), sort_keys=True),
+            folder=f"results/{RUN.run}/compare",
+            cfg=parameters.comparison_text(PLAN),
             code=code_digest("compare"),
         shell:
             "nbavatar compare --evals {input:q} --out {params.folder:q} --cfg {params.cfg:q} > {log:q} 2>&1"

@@ -9,9 +9,9 @@ OUTPUTS: results/{run}/tradeoff/{subject}/{variant}/..., results/{run}/tradeoff/
 # put beside the model by hand, because a job does not change another's output.
 rule tradeoff:
     input:
-        model="results/{run}/train/{subject}/{variant}/model.pt",
+        model=rules.train.output.model,
         meshes=meshes_of,
-        frames=lambda w: frames_under(RUN.tradeoff.protocol, w.subject),
+        frames=lambda w: judged_frames(w.subject, RUN.tradeoff.protocol),
         train=train_frames,
         sheet=RUN.tradeoff.sheet,
     output:
@@ -39,10 +39,10 @@ rule tradeoff:
         runtime="8h",
     params:
         what="--no-store",
-        given=given([RUN.tradeoff.sheet]),
+        given=given_digest([RUN.tradeoff.sheet]),
         device=RUN.device,
         folder=lambda w, output: Path(output.result).parent,
-        protocol=lambda w: protocol_text(RUN.tradeoff.protocol),
+        protocol=lambda w: parameters.protocol_text(PLAN, RUN.tradeoff.protocol),
         side=RUN.tradeoff.side,
         code=code_of("tradeoff"),
     shell:
@@ -70,7 +70,7 @@ use rule tradeoff as savings with:
 # The stages before training: what their knobs cost in time, and in millimetres.
 rule offline:
     input:
-        meshes=fitted,
+        meshes=lambda w: mesh_file(units.fitted(PLAN, w.subject)),
         sheet=RUN.tradeoff.sheet,
     output:
         result="results/{run}/tradeoff/{subject}/offline/offline.json",
@@ -90,7 +90,7 @@ rule offline:
         runtime="4h",
     params:
         folder=lambda w, output: Path(output.result).parent,
-        given=given([RUN.tradeoff.sheet]),
+        given=given_digest([RUN.tradeoff.sheet]),
         code=code_digest("tradeoff"),
     shell:
         "nbavatar tradeoff --offline --meshes {input.meshes:q} --sheet {input.sheet:q} --out {params.folder:q}"

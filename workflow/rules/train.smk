@@ -11,7 +11,7 @@ rule train:
     input:
         frames=train_frames,
         meshes=meshes_of,
-        spectral="results/{run}/spectral/{subject}.npz",
+        spectral=rules.spectral.output.meshes,
     output:
         model="results/{run}/train/{subject}/{variant}/model.pt",
         history="results/{run}/train/{subject}/{variant}/history.jsonl",
