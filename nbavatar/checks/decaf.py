@@ -11,7 +11,8 @@ import numpy as np
 
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import Camera, project
-from nbavatar.data.decaf import DecafSubject, check_counts, frame_counts, read_camera, read_cuts
+from nbavatar.data.decaf import check_counts, frame_counts, read_camera, read_cuts
+from nbavatar.data.decaf_files import DecafSubject
 from nbavatar.data.decaf_tracks import build_tracks
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.splits import runs_from_cuts
@@ -112,9 +113,9 @@ def _landmarks(subject: DecafSubject, sequence: MeshSequence) -> dict[str, np.nd
     from nbavatar.bodymodels.mano import Mano, shorten_tips
 
     head = sequence.parts["head"]
-    embedding = read_landmarks(subject.asset("landmark_embedding.npy"), len(head.faces))
+    embedding = read_landmarks(subject.assets.landmarks, len(head.faces))
     corners = head.verts[:, head.faces[embedding.full_faces]].astype(np.float64)
-    mano = Mano.build(read_mano(subject.asset("mano_v1_2", "models", "MANO_RIGHT.pkl")))
+    mano = Mano.build(read_mano(subject.assets.mano()))
     names = ("betas", "hand_pose", "global_orient", "transl")
     with torch.inference_mode():
         values = [torch.from_numpy(sequence.extras[f"param.right_hand.{name}"]) for name in names]

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from nbavatar.data.decaf import FOLDERS, KEYPOINTS, list_subjects
+from nbavatar.data.decaf_files import FOLDERS, PARTS, Assets, DecafSubject, list_subjects
 
 __all__ = ["SOURCES", "Missing", "missing_files", "missing_message"]
 
@@ -13,13 +13,6 @@ SOURCES = {
     "flame": "FLAME 2020: https://flame.is.tue.mpg.de (register, download 'FLAME 2020', take generic_model.pkl)",
     "landmarks": "landmark_embedding.npy: part of DECA, https://github.com/yfeng95/DECA (folder data)",
     "mano": "MANO v1.2: https://mano.is.tue.mpg.de (register, download 'Models & Code', take models/MANO_RIGHT.pkl)",
-}
-_ASSETS = {
-    "assets/generic_model.pkl": "flame",
-    "assets/landmark_embedding.npy": "landmarks",
-    "assets/mano_v1_2/models/MANO_RIGHT.pkl": "mano",
-    "assets/FLAME_neck_idx.npy": "decaf",
-    "assets/neck_idx.npy": "decaf",
 }
 
 
@@ -38,28 +31,16 @@ def missing_files(root: Path, cameras: Mapping[str, Sequence[str]]) -> list[Miss
         root: folder of the dataset, which need not exist.
         cameras: subject -> its cameras. A subject that is in neither folder is reported with `{train,test}`.
     """
-    missing = [Missing(path, source) for path, source in _ASSETS.items() if not (root / path).is_file()]
-    subjects = list_subjects(root)
-    for subject, ids in cameras.items():
-        folder = subjects.get(subject, "{" + ",".join(FOLDERS) + "}")
-        wanted = [f"{folder}/{kind}/{subject}/{camera}.mp4" for kind in ("videos", "segmentations") for camera in ids]
-        wanted += [
-            f"{folder}/{part}_{kind}/{subject}/{camera}.npy"
-            for part in KEYPOINTS
-            for kind in ("keys", "bbs")
-            for camera in ids
-        ]
-        wanted += [
-            f"{folder}/cameras/{subject}/cameras.pkl",
-            f"{folder}/params/{subject}/params_smoothed.pkl",
-            f"{folder}/deformations/{subject}/deforms.npy",
-            f"{folder}/contacts/{subject}/contacts_head.npy",
-            f"{folder}/contacts/{subject}/contacts_rh.npy",
-            f"{folder}/cutIDs/{subject}.pkl",
-            f"assets/accurate_shapes/{subject}.pkl",
-        ]
-        missing += [Missing(path, "decaf") for path in wanted if not (root / path).is_file()]
-    return missing
+    assets, subjects = Assets(Path("assets")), list_subjects(root)
+    wanted = dict(zip(assets.body_models, ("flame", "landmarks", "mano"), strict=True))
+    wanted |= dict.fromkeys((assets.neck_of_dents, assets.neck_of_contacts), "decaf")
+    for name, ids in cameras.items():
+        subject = DecafSubject(Path(), subjects.get(name, "{" + ",".join(FOLDERS) + "}"), name)
+        files = [file(camera) for file in (subject.video, subject.matte) for camera in ids]
+        files += [*subject.detections(ids), subject.calibration, subject.parameters, subject.deformations]
+        files += [*map(subject.contacts, PARTS), subject.cut_file, subject.own_shape]
+        wanted |= dict.fromkeys(files, "decaf")
+    return [Missing(path.as_posix(), source) for path, source in wanted.items() if not (root / path).is_file()]
 
 
 def missing_message(root: Path, missing: Sequence[Missing]) -> str:

@@ -28,7 +28,7 @@ from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import MATTE_THRESHOLD, CheckConfig
 from nbavatar.data.capture import read_mesh, read_rgb
-from nbavatar.data.decaf import CAMERAS, DecafSubject, find_subject
+from nbavatar.data.decaf_files import CAMERAS, DecafSubject, find_subject
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.images import encode_png
@@ -138,8 +138,8 @@ def _write_decaf_sheet(subject: DecafSubject, report: SubjectReport, path: Path)
     meshes = {name: (part.verts[0], part.faces) for name, part in report.sequence.parts.items()}
     rows = []
     for name, camera in progress(report.cameras.items(), f"overlays {subject.name}"):
-        image = next(read_video(subject.file("videos", f"{name}.mp4")))
-        matte = next(read_video(subject.file("segmentations", f"{name}.mp4"), gray=True))
+        image = next(read_video(subject.video(name)))
+        matte = next(read_video(subject.matte(name), gray=True))
         over = mesh_over_image(image, camera, meshes, (matte > MATTE_THRESHOLD).astype(np.uint8))
         rows.append([(f"{subject.name} {name} frame 0", image), ("meshes, outline of the matte", over)])
     with atomic_write(path) as temporary:

@@ -45,11 +45,6 @@ _OPTIONAL = {
     "pycolmap": "another reader of COLMAP's files",
     "transformers": "masks by SAM 3",
 }
-_BODY_MODELS = {
-    "flame": ("assets/generic_model.pkl", "flame"),
-    "landmarks": ("assets/landmark_embedding.npy", "landmarks"),
-    "mano": ("assets/mano_v1_2/models/MANO_RIGHT.pkl", "mano"),
-}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,7 +92,7 @@ def examine(root: Path) -> dict[str, Any]:
     """All findings as plain values; see the module for the keys."""
     from nbavatar.checks.decaf_inventory import SOURCES
     from nbavatar.cli import VERBS
-    from nbavatar.data.decaf import list_subjects
+    from nbavatar.data.decaf_files import Assets, list_subjects
 
     needed = {verb: third_party(verb) for verb in VERBS if verb != "doctor"}
     packages: dict[str, str | None] = {}
@@ -115,10 +110,10 @@ def examine(root: Path) -> dict[str, Any]:
     verbs = {verb: sorted(modules & lacking) for verb, modules in needed.items()}
     resources: dict[str, str | None] = {}
     get: dict[str, str] = {}
-    for name, (path, source) in _BODY_MODELS.items():
-        resources[name] = str(root / path) if (root / path).is_file() else None
+    for name, path in zip(("flame", "landmarks", "mano"), Assets(root / "assets").body_models, strict=True):
+        resources[name] = str(path) if path.is_file() else None
         if resources[name] is None:
-            get[name] = f"{SOURCES[source]}; put at {root / path}"
+            get[name] = f"{SOURCES[name]}; put at {path}"
     subjects = list_subjects(root) if root.is_dir() else {}
     resources["dataset"] = f"{root} ({', '.join(sorted(subjects))})" if subjects else None
     if not subjects:

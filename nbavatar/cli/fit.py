@@ -33,6 +33,7 @@ from nbavatar.cli.common import add_cfg_argument, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.geometry import FitConfig
 from nbavatar.config.preprocess import MATTE_THRESHOLD
+from nbavatar.data.decaf_files import Assets
 from nbavatar.data.sequences import MeshSequence, read_sequence, write_sequence
 from nbavatar.errors import DataError
 from nbavatar.fitting.pictures import contact_sheet
@@ -62,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> None:
     """Fits and writes."""
     cfg = stage_config(args, FitConfig)
-    tracks, assets = _read_tracks(args.tracks), Path(args.assets)
+    tracks, assets = _read_tracks(args.tracks), Assets(Path(args.assets))
     bodies, files = _read_bodies(assets, tracks.extras)
     with contextlib.ExitStack() as stack:
         packs: dict[str, FramePack] = {}
@@ -93,13 +94,13 @@ def _read_tracks(path: str) -> MeshSequence:
     return MeshSequence(frames, {}, arrays)
 
 
-def _read_bodies(assets: Path, extras: dict[str, Any]) -> tuple[Bodies, dict[str, Path]]:
+def _read_bodies(assets: Assets, extras: dict[str, Any]) -> tuple[Bodies, dict[str, Path]]:
     """The models that the keypoints ask for, and the files they came from."""
     wanted = {name.split(".")[1] for name in extras if name.startswith("keypoints.")}
     files: dict[str, Path] = {}
     head, hands = None, {}
     if "head" in wanted:
-        files = {"flame": assets / "generic_model.pkl", "landmarks": assets / "landmark_embedding.npy"}
+        files = {"flame": assets.flame, "landmarks": assets.landmarks}
         arrays = read_flame(files["flame"])
         counts = {
             key: extras[name].shape[1]
@@ -109,8 +110,8 @@ def _read_bodies(assets: Path, extras: dict[str, Any]) -> tuple[Bodies, dict[str
         landmarks = read_landmarks(files["landmarks"], len(arrays.faces))
         head = Flame.build(arrays, landmarks, dtype=torch.float64, **counts)
     if wanted & {"right_hand", "left_hand"}:
-        folder = assets / "mano_v1_2" / "models"
-        found = {side: folder / f"MANO_{side.upper()}.pkl" for side in ("right", "left")}
+        found = {side: assets.mano(side) for side in ("right", "left")}
+        folder = assets.mano().parent
         found = {side: path for side, path in found.items() if path.is_file()}
         if not found:
             raise DataError.of(folder, expected="MANO_RIGHT.pkl or MANO_LEFT.pkl", found="neither")

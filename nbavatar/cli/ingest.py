@@ -24,7 +24,8 @@ from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import IngestConfig
 from nbavatar.data.capture import open_capture
-from nbavatar.data.decaf import find_subject, read_camera
+from nbavatar.data.decaf import read_camera
+from nbavatar.data.decaf_files import find_subject
 from nbavatar.data.frame_plan import manifest_of, plan_capture, plan_decaf
 from nbavatar.errors import ConfigError
 from nbavatar.io.framepack import FramePackWriter
@@ -62,8 +63,8 @@ def main(args: argparse.Namespace) -> None:
         plan = plan_decaf(subject, [args.camera], **choice)
         layers: tuple[str, ...] = ("rgb", "person")
         images = decaf_images(subject, camera, plan)
-        inputs = {kind: subject.file(kind, f"{args.camera}.mp4") for kind in ("videos", "segmentations")}
-        inputs |= {"cameras": subject.file("cameras", "cameras.pkl"), "cutIDs": subject.cut_file}
+        names = ("videos", "segmentations", "cameras", "cutIDs")
+        inputs = dict(zip(names, subject.camera_files(args.camera), strict=True))
         report["folder"] = subject.folder
     else:
         capture = open_capture(args.root, pixel_center=cfg.pixel_center)

@@ -18,6 +18,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from nbavatar.data.decaf_files import Assets
 from nbavatar.data.sequences import SHELL, MeshSequence, read_sequence, write_sequence
 from nbavatar.errors import DataError
 from nbavatar.provenance import run_record
@@ -51,7 +52,7 @@ def main(args: argparse.Namespace) -> int:
         missing = "--assets" if known else f"param.* of {', '.join(parts)}"
         raise DataError.of("--by parameters", expected="parameters in both files and --assets", found=f"no {missing}")
     by_parameters = args.by == "parameters" or (args.by == "auto" and known and args.assets is not None)
-    bodies, files = _bodies(Path(args.assets or ""), parts, source) if by_parameters else (None, {})
+    bodies, files = _bodies(Assets(Path(args.assets or "")), parts, source) if by_parameters else (None, {})
     driven = drive(source, target, parts, bodies=bodies, place=args.place, keep_contact=not args.free_hands)
     if SHELL in source.parts and "head" in driven.parts:
         shell = carried(source.parts[SHELL], source.parts["head"], driven.parts["head"].verts)
@@ -65,7 +66,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _bodies(assets: Path, parts: list[str], source: MeshSequence) -> tuple[dict, dict[str, Path]]:
+def _bodies(assets: Assets, parts: list[str], source: MeshSequence) -> tuple[dict, dict[str, Path]]:
     """Body model of every part, and the files they came from."""
     import torch
 
@@ -76,20 +77,20 @@ def _bodies(assets: Path, parts: list[str], source: MeshSequence) -> tuple[dict,
     bodies, files = {}, {}
     for part in parts:
         if part == "head":
-            files["flame"] = assets / "generic_model.pkl"
+            files["flame"] = assets.flame
             counts = {f"{key}_count": source.extras[f"param.head.{key}"].shape[1] for key in ("shape", "expression")}
             body = Flame.build(read_flame(files["flame"]), dtype=torch.float64, **counts)
         else:
             side = part.partition("_")[0]
             other = {"left": "right", "right": "left"}[side]
-            own, mirrored = (assets / "mano_v1_2" / "models" / f"MANO_{s.upper()}.pkl" for s in (side, other))
+            own, mirrored = map(assets.mano, (side, other))
             path = own if own.is_file() else mirrored
             files[f"mano_{path.stem.rpartition('_')[2].lower()}"] = path
             arrays = read_mano(path)
             body = Mano.build(arrays if path == own else mirror_model(arrays), side, dtype=torch.float64)
         if body.faces.shape != source.parts[part].faces.shape:
             raise DataError.of(
-                assets, part, expected=f"a model of {len(source.parts[part].faces)} faces", found=len(body.faces)
+                assets.folder, part, expected=f"a model of {len(source.parts[part].faces)} faces", found=len(body.faces)
             )
         bodies[part] = body
     return bodies, files

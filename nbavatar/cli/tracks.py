@@ -27,7 +27,8 @@ from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import TracksConfig
 from nbavatar.data.capture import open_capture
 from nbavatar.data.capture_tracks import build_capture_tracks
-from nbavatar.data.decaf import find_subject, read_camera
+from nbavatar.data.decaf import read_camera
+from nbavatar.data.decaf_files import find_subject
 from nbavatar.data.decaf_tracks import build_tracks
 from nbavatar.data.frame_plan import plan_capture, plan_decaf
 from nbavatar.data.sequences import write_sequence
@@ -69,10 +70,8 @@ def main(args: argparse.Namespace) -> None:
         cameras = {name: camera for name, (camera, _) in read.items()}
         sequence, report = build_tracks(subject, cameras, plan.numbers, plan.count, **tolerances)
         report["cameras"] = {name: found for name, (_, found) in read.items()}
-        files = ("params/{}/params_smoothed.pkl", "cameras/{}/cameras.pkl", "cutIDs/{}.pkl")
-        inputs = {name.split("/")[0]: subject.root / subject.folder / name.format(subject.name) for name in files}
-        inputs["flame"] = subject.asset("generic_model.pkl")
-        inputs["mano"] = subject.asset("mano_v1_2", "models", "MANO_RIGHT.pkl")
+        inputs = {"params": subject.parameters, "cameras": subject.calibration, "cutIDs": subject.cut_file}
+        inputs |= {"flame": subject.assets.flame, "mano": subject.assets.mano()}
     else:
         capture = open_capture(args.root, pixel_center=cfg.pixel_center)
         plan = plan_capture(capture, **choice)

@@ -1,8 +1,8 @@
-"""The Decaf dataset on disk: where things are, and arrays as they are stored, checked.
+"""The arrays of the Decaf dataset as they are stored, checked; `decaf_files` says where they are.
 
-The release keeps each subject in ONE of two folders, `train` or `test`; both are searched. Nothing here is computed:
-`decaf_tracks` turns parameters into meshes. What the release's documentation leaves open is accepted in all plausible
-forms and reported: frame keys as numbers or text, distortion coefficients under any of several names.
+Nothing here is computed: `decaf_tracks` turns parameters into meshes. What the release's documentation leaves open is
+accepted in all plausible forms and reported: frame keys as numbers or text, distortion coefficients under any of
+several names.
 
     cameras        K float64 [3, 3] [px], cam_from_world float64 [4, 4] [m], distortion [12] or None
     parameters     float32 [N, size] per part and name; angles [rad], translations [m]
@@ -11,7 +11,6 @@ forms and reported: frame keys as numbers or text, distortion coefficients under
     contacts       bool [N, V];  deformations float32 [N, V, 3] [m], the head's own axes, to be SUBTRACTED
 """
 
-import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 
 from nbavatar.camera.distortion import checked_coefficients
 from nbavatar.camera.pinhole import Camera
+from nbavatar.data.decaf_files import PARTS, DecafSubject
 from nbavatar.errors import DataError, describe, did_you_mean, parsing
 from nbavatar.io.arrays import as_numbers, read_array_header
 from nbavatar.io.pickles import read_array, read_pickle
@@ -28,13 +28,9 @@ from nbavatar.io.video import probe_video
 from nbavatar.names import check_name
 
 __all__ = [
-    "CAMERAS",
-    "FOLDERS",
-    "DecafSubject",
+    "KEYPOINTS",
     "check_counts",
-    "find_subject",
     "frame_counts",
-    "list_subjects",
     "read_boxes",
     "read_camera",
     "read_cuts",
@@ -43,8 +39,6 @@ __all__ = [
     "read_parameters",
 ]
 
-FOLDERS = ("train", "test")
-CAMERAS = ("084", "100", "102", "108", "110", "111", "121", "122")
 KEYPOINTS = {"head": 68, "right_hand": 21}
 _DISTORTION_KEYS = (
     "distortion", "dist", "dist_coeffs", "distCoeffs", "dist_coeff", "dist_coef", "distortion_coefficients",
@@ -63,80 +57,6 @@ _FIXED_SIZES = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class DecafSubject:
-    """One subject of one dataset.
-
-    Attributes:
-        root: the folder that holds `assets`, `train` and `test`.
-        folder: `train` or `test`, wherever the subject was found.
-        name: such as `S2`.
-    """
-
-    root: Path
-    folder: str
-    name: str
-
-    def file(self, kind: str, *names: str) -> Path:
-        """Path of a file of the subject, such as `file("videos", "084.mp4")`."""
-        return self.root / self.folder / kind / self.name / "/".join(names)
-
-    @property
-    def cut_file(self) -> Path:
-        """Path of the subject's cut ids."""
-        return self.root / self.folder / "cutIDs" / f"{self.name}.pkl"
-
-    @property
-    def cameras(self) -> list[str]:
-        """Cameras that have a video, sorted."""
-        return sorted(path.stem for path in self.file("videos").glob("*.mp4"))
-
-    def asset(self, *names: str) -> Path:
-        """Path of a file below `assets`."""
-        return self.root.joinpath("assets", *names)
-
-    @property
-    def head_poses(self) -> Path:
-        """Path of the stored canonical-to-world head poses."""
-        return self.asset("transformation", self.folder, f"{self.name}_RT_FromCanToRef_wo_poseparams.npy")
-
-    @property
-    def own_shape(self) -> Path:
-        """Path of the subject's own shape parameters."""
-        return self.asset("accurate_shapes", f"{self.name}.pkl")
-
-
-def list_subjects(root: Path) -> dict[str, str]:
-    """Subjects that have a folder of videos or parameters: name -> `train` or `test`."""
-    found: dict[str, str] = {}
-    for folder in FOLDERS:
-        for kind in ("videos", "params"):
-            for path in sorted((root / folder / kind).glob("*")):
-                if path.is_dir():
-                    found.setdefault(path.name, folder)
-    return found
-
-
-def find_subject(root: str | Path, name: str) -> DecafSubject:
-    """Looks for a subject in both folders.
-
-    Raises:
-        DataError: no such dataset, no such subject (those that exist are said), or the subject is in both folders.
-    """
-    root = Path(root)
-    if not root.is_dir():
-        raise DataError.of(root, expected="the folder of the Decaf dataset", found="no such folder")
-    check_name(name, root, "subject", error=DataError)
-    subjects = list_subjects(root)
-    if not subjects:
-        raise DataError.of(root, expected="train/videos/<subject> and test/videos/<subject>", found="neither")
-    if name not in subjects:
-        raise DataError(f"{root}: unknown subject '{name}'; {did_you_mean(name, subjects)}")
-    if all((root / folder / "params" / name).is_dir() for folder in FOLDERS):
-        raise DataError.of(root, name, expected="the subject in train or in test", found="it in both folders")
-    return DecafSubject(root, subjects[name], name)
-
-
 def read_camera(subject: DecafSubject, camera: str, *, pixel_center: float = 0.5) -> tuple[Camera, dict[str, Any]]:
     """Reads one camera's calibration, its size from the video.
 
@@ -151,7 +71,7 @@ def read_camera(subject: DecafSubject, camera: str, *, pixel_center: float = 0.5
     Raises:
         DataError: no such camera or video, or a calibration that is no pinhole camera.
     """
-    path = subject.file("cameras", "cameras.pkl")
+    path = subject.calibration
     check_name(camera, path, "camera", error=DataError)
     stored = read_pickle(path)
     if not isinstance(stored, Mapping):
@@ -162,7 +82,7 @@ def read_camera(subject: DecafSubject, camera: str, *, pixel_center: float = 0.5
         raise DataError(f"{path}: no camera '{camera}'; {did_you_mean(camera, by_name)}")
     if camera not in subject.cameras:
         known = did_you_mean(camera, subject.cameras) if subject.cameras else "no camera has one"
-        raise DataError(f"{subject.file('videos')}: subject {subject.name} has no video {camera}.mp4; {known}")
+        raise DataError(f"{subject.videos}: subject {subject.name} has no video {camera}.mp4; {known}")
     entry, where = by_name[camera], f"{path}: camera {camera}"
     if not isinstance(entry, Mapping):
         raise DataError.of(where, expected="a mapping with intrinsic and extrinsic", found=type(entry).__name__)
@@ -181,7 +101,7 @@ def read_camera(subject: DecafSubject, camera: str, *, pixel_center: float = 0.5
         raise DataError.of(where, "extrinsic", expected="a rotation", found=found)
     with parsing(where, "distortion coefficients", damaged="something else"):
         key, coefficients = _distortion(entry, where)
-    info = probe_video(subject.file("videos", f"{camera}.mp4"))
+    info = probe_video(subject.video(camera))
     shift = 0.5 - pixel_center
     K[0, 2] += shift
     K[1, 2] += shift
@@ -202,7 +122,7 @@ def read_parameters(subject: DecafSubject) -> dict[str, dict[str, np.ndarray]]:
         DataError: a key that is no frame number, a missing or misshapen field, or a number that is not finite; the
             frame and the field are named.
     """
-    path = subject.file("params", "params_smoothed.pkl")
+    path = subject.parameters
     stored = read_pickle(path)
     if not isinstance(stored, Mapping) or not stored:
         raise DataError.of(path, expected="a mapping from frame to parameters", found=type(stored).__name__)
@@ -238,7 +158,7 @@ def read_parameters(subject: DecafSubject) -> dict[str, dict[str, np.ndarray]]:
 
 def read_keypoints(subject: DecafSubject, part: str, camera: str) -> np.ndarray:
     """Reads landmarks of `head` or `right_hand`, float32 `[N, 68 | 21, 3]`; undetected ones get confidence 0."""
-    stored = read_frame_array(subject.file(f"{part}_keys", f"{camera}.npy"), (KEYPOINTS[part], 3))
+    stored = read_frame_array(subject.keypoints(part, camera), (KEYPOINTS[part], 3))
     with np.errstate(over="ignore"):
         points = stored.astype(np.float32)
     lost = ~np.isfinite(points).all(axis=-1) | (points[..., :2] < 0).all(axis=-1)
@@ -252,7 +172,7 @@ def read_boxes(subject: DecafSubject, part: str, camera: str, width: int, height
     A failed detection is stored as -1; such rows, and boxes that are empty or leave the frame, become NaN. They must
     not be taken for the whole frame, which would blow up any crop made from them.
     """
-    stored = read_frame_array(subject.file(f"{part}_bbs", f"{camera}.npy"), (4,))
+    stored = read_frame_array(subject.boxes(part, camera), (4,))
     with np.errstate(invalid="ignore", over="ignore"):
         boxes = stored.astype(np.float32)
         x0, y0, x1, y1 = boxes.T
@@ -291,18 +211,11 @@ def frame_counts(subject: DecafSubject, cameras: Sequence[str]) -> dict[Path, in
     """Number of frames by the header of every video and array that exists, for the cameras named."""
     counts: dict[Path, int] = {}
     for camera in cameras:
-        for kind in ("videos", "segmentations"):
-            path = subject.file(kind, f"{camera}.mp4")
+        for path in (subject.video(camera), subject.matte(camera)):
             if path.is_file():
                 counts[path] = probe_video(path).count
-    arrays = [
-        subject.file(f"{part}_{kind}", f"{camera}.npy")
-        for camera in cameras
-        for part in KEYPOINTS
-        for kind in ("keys", "bbs")
-    ]
-    arrays += [subject.file("contacts", "contacts_head.npy"), subject.file("contacts", "contacts_rh.npy")]
-    arrays += [subject.file("deformations", "deforms.npy"), subject.head_poses]
+    arrays = subject.detections(cameras) + [subject.contacts(part) for part in PARTS]
+    arrays += [subject.deformations, subject.head_poses]
     for path in arrays:
         if path.is_file():
             counts[path] = _header_rows(path)

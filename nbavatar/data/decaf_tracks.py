@@ -14,6 +14,7 @@ besides those of `sequences`:
 """
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,12 +22,12 @@ import numpy as np
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.decaf import (
     KEYPOINTS,
-    DecafSubject,
     read_boxes,
     read_frame_array,
     read_keypoints,
     read_parameters,
 )
+from nbavatar.data.decaf_files import PARTS, DecafSubject
 from nbavatar.data.sequences import MeshSequence, Part
 from nbavatar.errors import DataError, parsing
 from nbavatar.io.arrays import as_numbers
@@ -39,7 +40,6 @@ _PARAM_NAMES = {
              "transl": "transl"},
     "right_hand": {"betas": "betas", "global_orient": "global_orient", "hand_pose": "hand_pose", "transl": "transl"},
 }  # fmt: skip
-_CONTACT_FILES = {"head": "contacts_head.npy", "right_hand": "contacts_rh.npy"}
 _BATCH = 64
 
 
@@ -79,7 +79,7 @@ def build_tracks(
     from nbavatar.bodymodels.flame import Flame, jaw_of_pose_params
     from nbavatar.bodymodels.mano import Mano
 
-    parameter_file = subject.file("params", "params_smoothed.pkl")
+    parameter_file = subject.parameters
     parameters = read_parameters(subject)
     found = len(parameters["head"]["transl"])
     if found != count:
@@ -91,7 +91,7 @@ def build_tracks(
     chosen = {part: {name: values[frames] for name, values in of.items()} for part, of in parameters.items()}
 
     head, hand = chosen["head"], chosen["right_hand"]
-    flame_file, mano_file = subject.asset("generic_model.pkl"), subject.asset("mano_v1_2", "models", "MANO_RIGHT.pkl")
+    flame_file, mano_file = subject.assets.flame, subject.assets.mano()
     flame = Flame.build(
         read_flame(flame_file),
         shape_count=head["shape_params"].shape[1],
@@ -163,7 +163,7 @@ def _own_shape(
         worst = int(off.argmax())
         report[f"shape_deviation.{part}"] = float(off[worst])
         if off[worst] > tolerance:
-            where = f"{subject.file('params', 'params_smoothed.pkl')}: frame {worst}"
+            where = f"{subject.parameters}: frame {worst}"
             expected = f"the subject's own shape ({path if stored is not None else 'the median over frames'})"
             fix = "if that is meant, raise shape_tolerance of the tracks stage"
             found = f"a deviation of {off[worst]:.3g}, more than {tolerance:g}"
@@ -211,8 +211,8 @@ def _detections(
                 read_keypoints(subject, part, name),
                 read_boxes(subject, part, name, camera.width, camera.height),
             )
-            result[f"keypoints.{part}.{name}"] = _rows(keys, subject.file(f"{part}_keys", f"{name}.npy"), count)[frames]
-            result[f"boxes.{part}.{name}"] = _rows(boxes, subject.file(f"{part}_bbs", f"{name}.npy"), count)[frames]
+            result[f"keypoints.{part}.{name}"] = _rows(keys, subject.keypoints(part, name), count)[frames]
+            result[f"boxes.{part}.{name}"] = _rows(boxes, subject.boxes(part, name), count)[frames]
     return result
 
 
@@ -231,16 +231,16 @@ def _contacts(
 
     result: dict[str, np.ndarray] = {}
     vertices = {name: len(part.rest) for name, part in parts.items()}
-    for part, file in _CONTACT_FILES.items():
-        path = subject.file("contacts", file)
+    for part in PARTS:
+        path = subject.contacts(part)
         if not path.is_file():
             absent.append(str(path.relative_to(subject.root)))
             continue
         labels = _rows(read_frame_array(path, (vertices[part],)), path, count)[frames] != 0
         if part == "head":
-            labels[:, _vertex_ids(subject, "neck_idx.npy", vertices[part])] = False
+            labels[:, _vertex_ids(subject.assets.neck_of_contacts, vertices[part])] = False
         result[f"contact.{part}"] = labels
-    path = subject.file("deformations", "deforms.npy")
+    path = subject.deformations
     if not path.is_file():
         absent.append(str(path.relative_to(subject.root)))
         return result
@@ -248,14 +248,13 @@ def _contacts(
     bad = np.flatnonzero(~np.isfinite(dents).all(axis=(1, 2)))
     if len(bad):
         raise DataError.of(f"{path}: frame {frames[bad[0]]}", expected="finite numbers", found="NaN or infinity")
-    dents[:, _vertex_ids(subject, "FLAME_neck_idx.npy", vertices["head"])] = 0.0
+    dents[:, _vertex_ids(subject.assets.neck_of_dents, vertices["head"])] = 0.0
     rotation = axis_angle_to_matrix(torch.from_numpy(global_orient.astype(np.float64))).numpy().astype(np.float32)
     result["deformation.head"] = -np.einsum("nij,nvj->nvi", rotation, dents)
     return result
 
 
-def _vertex_ids(subject: DecafSubject, file: str, vertices: int) -> np.ndarray:
-    path = subject.asset(file)
+def _vertex_ids(path: Path, vertices: int) -> np.ndarray:
     with parsing(path, "vertex ids"):
         ids = as_numbers(read_array(path)).reshape(-1)
     if ids.dtype.kind not in "iuf" or (len(ids) and (ids.min() < 0 or ids.max() >= vertices)):

@@ -6,7 +6,8 @@ from typing import Any
 
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.capture import Capture, read_splits
-from nbavatar.data.decaf import DecafSubject, check_counts, frame_counts, read_cuts
+from nbavatar.data.decaf import check_counts, frame_counts, read_cuts
+from nbavatar.data.decaf_files import DecafSubject
 from nbavatar.data.splits import choose_frames, held_out_blocks, runs_from_cuts, split_digest
 from nbavatar.errors import DataError
 
@@ -51,7 +52,7 @@ def plan_decaf(
     runs = runs_from_cuts(read_cuts(subject), count, str(subject.cut_file))
     numbers, segments = choose_frames(runs, start=start, every=every, max_frames=max_frames)
     if not numbers:
-        raise DataError.of(subject.file("videos"), "frames", expected=f"more than start = {start}", found=count)
+        raise DataError.of(subject.videos, "frames", expected=f"more than start = {start}", found=count)
     frames = [f"{number:06d}" for number in numbers]
     words = held_out_blocks(segments, fraction=test_fraction, blocks=test_blocks)
     return FramePlan(frames, numbers, segments, dict(zip(frames, words)), count)

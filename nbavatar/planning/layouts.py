@@ -10,11 +10,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from nbavatar.config.inputs import files_digest, given_digest, mesh_digest, rig_digest, supplied_digest
+from nbavatar.data.decaf_files import Assets, expected_subject
 from nbavatar.planning.run import Plan
 
 __all__ = [
-    "assets_folder",
-    "body_models",
+    "assets",
     "camera_files",
     "capture_digests",
     "data_digest",
@@ -25,23 +25,10 @@ __all__ = [
     "track_files",
 ]
 
-# Where the release keeps its subjects; a dataset that is yet to be made follows it.
-_TEST_SUBJECTS = ("S1", "S3", "S6")
 
-
-def assets_folder(plan: Plan) -> Path:
-    """Folder of the body models that a Decaf dataset needs."""
-    return Path(plan.run.data_root) / "assets"
-
-
-def body_models(plan: Plan) -> list[Path]:
-    """Body models, supplied by the user."""
-    base = assets_folder(plan)
-    return [
-        base / "generic_model.pkl",
-        base / "landmark_embedding.npy",
-        base / "mano_v1_2" / "models" / "MANO_RIGHT.pkl",
-    ]
+def assets(plan: Plan) -> Assets:
+    """Body models of a Decaf dataset, supplied by the user."""
+    return Assets(Path(plan.run.data_root) / "assets")
 
 
 def _rig(plan: Plan, subject: str) -> list[Path]:
@@ -49,42 +36,18 @@ def _rig(plan: Plan, subject: str) -> list[Path]:
     return [base / "cameras.json", base / "splits.json"]
 
 
-def _split_folder(plan: Plan, subject: str) -> Path:
-    """`train` or `test`: Decaf splits its release by subject."""
-    base = Path(plan.subjects[subject].root)
-    found = [name for name in ("train", "test") if (base / name / "params" / subject).is_dir()]
-    return base / (found[0] if found else "test" if subject in _TEST_SUBJECTS else "train")
-
-
 def camera_files(plan: Plan, subject: str, camera: str) -> list[Path]:
     """Files that one camera's frames come from."""
     if plan.captured:
         return _rig(plan, subject)
-    base = _split_folder(plan, subject)
-    return [
-        base / "videos" / subject / f"{camera}.mp4",
-        base / "segmentations" / subject / f"{camera}.mp4",
-        base / "cameras" / subject / "cameras.pkl",
-        base / "cutIDs" / f"{subject}.pkl",
-    ]
+    return expected_subject(plan.subjects[subject].root, subject).camera_files(camera)
 
 
 def track_files(plan: Plan, subject: str) -> list[Path]:
     """Files that a subject's parameters and meshes come from."""
     if plan.captured:
         return _rig(plan, subject)
-    base = _split_folder(plan, subject)
-    keyed = ("head_keys", "right_hand_keys", "head_bbs", "right_hand_bbs")
-    return [
-        base / "params" / subject / "params_smoothed.pkl",
-        base / "cameras" / subject / "cameras.pkl",
-        base / "cutIDs" / f"{subject}.pkl",
-        base / "deformations" / subject / "deforms.npy",
-        base / "contacts" / subject / "contacts_head.npy",
-        base / "contacts" / subject / "contacts_rh.npy",
-        *(base / name / subject / f"{camera}.npy" for name in keyed for camera in plan.subjects[subject].cameras),
-        *body_models(plan),
-    ]
+    return expected_subject(plan.subjects[subject].root, subject).track_files(plan.subjects[subject].cameras)
 
 
 def dataset(plan: Plan) -> list[Path]:

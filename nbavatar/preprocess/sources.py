@@ -8,7 +8,7 @@ import numpy as np
 
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.capture import Capture, read_rgb
-from nbavatar.data.decaf import DecafSubject
+from nbavatar.data.decaf_files import DecafSubject
 from nbavatar.data.frame_plan import FramePlan
 from nbavatar.errors import DataError
 from nbavatar.io.video import probe_video, read_video
@@ -32,8 +32,8 @@ def decaf_images(subject: DecafSubject, camera: Camera, plan: FramePlan) -> Iter
         DataError: at once, if a video is missing or the mask has another size; on the way, if one is truncated or has
             another number of frames.
     """
-    colour = subject.file("videos", f"{camera.name}.mp4")
-    matte = subject.file("segmentations", f"{camera.name}.mp4")
+    colour = subject.video(camera.name)
+    matte = subject.matte(camera.name)
     info = probe_video(matte)
     if (info.width, info.height) != (camera.width, camera.height):
         expected = f"{camera.width} x {camera.height} as in {colour}"

@@ -119,9 +119,10 @@ def _landmarks(path: Path) -> None:
 
 def _decaf(path: Path) -> None:
     from nbavatar.data import decaf
+    from nbavatar.data.decaf_files import find_subject
     from nbavatar.data.splits import runs_from_cuts
 
-    subject = decaf.find_subject(_root(path), "S2")
+    subject = find_subject(_root(path), "S2")
     if path.name == "cameras.pkl":
         for camera in ("084", "100"):
             decaf.read_camera(subject, camera)

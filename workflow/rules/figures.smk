@@ -19,11 +19,11 @@ rule reenact:
         mem="8GB",
         runtime="1h",
     params:
-        assets=([] if PLAN.captured else ["--assets", str(layouts.assets_folder(PLAN))]),
+        assets=([] if PLAN.captured else ["--assets", str(layouts.assets(PLAN).folder)]),
         given=(
             ""
             if PLAN.captured
-            else layouts.data_digest(PLAN, layouts.body_models(PLAN))
+            else layouts.data_digest(PLAN, layouts.assets(PLAN).body_models)
         ),
         code=code_digest("reenact"),
     shell:

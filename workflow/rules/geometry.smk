@@ -15,7 +15,7 @@ if not PLAN.captured:
             frames=lambda w: files(
                 rules.ingest.output, units.training_views(PLAN, w.subject)
             ),
-            assets=layouts.body_models(PLAN),
+            assets=layouts.assets(PLAN).body_models,
         output:
             meshes="results/{run}/fit/{subject}.npz",
             sheet=report(
@@ -35,8 +35,8 @@ if not PLAN.captured:
             mem="16GB",
             runtime="8h",
         params:
-            assets=layouts.assets_folder(PLAN),
-            given=layouts.data_digest(PLAN, layouts.body_models(PLAN)),
+            assets=layouts.assets(PLAN).folder,
+            given=layouts.data_digest(PLAN, layouts.assets(PLAN).body_models),
             cfg=options("fit"),
             code=code_digest("fit"),
         shell:

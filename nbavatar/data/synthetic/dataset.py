@@ -17,6 +17,7 @@ import numpy as np
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import Camera, project
 from nbavatar.config.synthetic import RECORD, refuse_others
+from nbavatar.data.decaf_files import Assets, DecafSubject, release_subject
 from nbavatar.data.synthetic.capture import write_capture
 from nbavatar.data.synthetic.figure import build_figure, pose_figure
 from nbavatar.data.synthetic.legacy_pickle import dump_array, dump_legacy
@@ -28,13 +29,10 @@ from nbavatar.io.atomic import atomic_write
 from nbavatar.io.records import write_json
 from nbavatar.io.video import VideoWriter
 
-__all__ = ["TEST_SUBJECTS", "detect", "write_assets", "write_dataset", "write_subject"]
+__all__ = ["detect", "write_assets", "write_dataset", "write_subject"]
 
 T = TypeVar("T")
 Progress = Callable[[Iterable[T], str, int], Iterable[T]]
-
-TEST_SUBJECTS = ("S1", "S3", "S6")
-"""Subjects that the release keeps in its folder `test`."""
 
 FRAMES_PER_SECOND = 50.0
 
@@ -147,16 +145,16 @@ def write_dataset(
 
 def write_assets(root: Path, human: Human) -> None:
     """Writes the body models and index files that a user of the release has to bring along, licence-free."""
-    assets = root / "assets"
+    assets = Assets(root / "assets")
     right = mano_content(human)
-    _bytes(assets / "generic_model.pkl", dump_legacy(flame_content(human), python2=True))
-    _bytes(assets / "landmark_embedding.npy", dump_array(landmark_content(human)))
-    _bytes(assets / "mano_v1_2" / "models" / "MANO_RIGHT.pkl", dump_legacy(right, python2=True))
-    _bytes(assets / "mano_v1_2" / "models" / "MANO_LEFT.pkl", dump_legacy(mirrored_mano_content(right), python2=True))
-    _save(assets / "left_right_face_corresps.npy", human.flip)
-    _save(assets / "FLAME_neck_idx.npy", human.neck())
-    _save(assets / "neck_idx.npy", human.neck(0.008))
-    _bytes(assets / "default_mesh.ply", _ply(human.head, human.head_faces))
+    _bytes(assets.flame, dump_legacy(flame_content(human), python2=True))
+    _bytes(assets.landmarks, dump_array(landmark_content(human)))
+    _bytes(assets.mano(), dump_legacy(right, python2=True))
+    _bytes(assets.mano("left"), dump_legacy(mirrored_mano_content(right), python2=True))
+    _save(assets.folder / "left_right_face_corresps.npy", human.flip)
+    _save(assets.neck_of_dents, human.neck())
+    _save(assets.neck_of_contacts, human.neck(0.008))
+    _bytes(assets.folder / "default_mesh.ply", _ply(human.head, human.head_faces))
 
 
 def write_subject(
@@ -176,8 +174,7 @@ def write_subject(
 ) -> None:
     """Writes all files of one subject; see `write_dataset` for the arguments (`keypoint_noise` here in pixels)."""
     name = scene.subject.name
-    split = "test" if name in TEST_SUBJECTS else "train"
-    base, assets = root / split, root / "assets"
+    subject = release_subject(root, name)
     rng = np.random.default_rng([seed, scene.subject.seed, 53])
     human, count = scene.bodies.human, len(scene.head)
 
@@ -197,7 +194,7 @@ def write_subject(
         }
         for n in range(count)
     }
-    _bytes(base / "params" / name / "params_smoothed.pkl", dump_legacy(frames))
+    _bytes(subject.parameters, dump_legacy(frames))
     rig = {
         camera: {
             "intrinsic": c.K,
@@ -206,29 +203,29 @@ def write_subject(
         }
         for camera, c in cameras.items()
     }
-    _bytes(base / "cameras" / name / "cameras.pkl", dump_legacy(rig))
+    _bytes(subject.calibration, dump_legacy(rig))
     segments = scene.motion.segments
     cuts = [(int(a[1]), int(b[0])) for a, b in zip(segments, segments[1:], strict=False)]
-    _bytes(base / "cutIDs" / f"{name}.pkl", dump_legacy(cuts))
+    _bytes(subject.cut_file, dump_legacy(cuts))
     shape = {
         "head": {"shape_params": scene.subject.shape.astype(np.float32)},
         "right_hand": {"betas": scene.subject.betas.astype(np.float32)},
     }
-    _bytes(assets / "accurate_shapes" / f"{name}.pkl", dump_legacy(shape))
+    _bytes(subject.own_shape, dump_legacy(shape))
 
     rotation = _rotations(scene)
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = rotation
     poses[:, :3, 3] = scene.head_rigid.mean(1) - np.einsum("nij,nj->ni", rotation, scene.canonical.mean(1))
-    _save(assets / "transformation" / split / f"{name}_RT_FromCanToRef_wo_poseparams.npy", poses)
+    _save(subject.head_poses, poses)
     # stored with the minus sign and in the canonical frame; ids on the neck hold what the release calls invalid
     deform = -np.einsum("nji,nvj->nvi", rotation, scene.offset)
     neck = human.neck()
     deform[:, neck] = rng.normal(0, 2e-3, (count, len(neck), 3))
-    _save(base / "deformations" / name / "deforms.npy", deform.astype(np.float32))
-    contacts = base / "contacts" / name
-    _save(contacts / "contacts_head.npy", scene.contact_head.astype(np.float32))
-    _save(contacts / "contacts_rh.npy", scene.contact_hand.astype(np.float32))
+    _save(subject.deformations, deform.astype(np.float32))
+    contacts = subject.contacts("head").parent
+    _save(subject.contacts("head"), scene.contact_head.astype(np.float32))
+    _save(subject.contacts("right_hand"), scene.contact_hand.astype(np.float32))
     _save(contacts / "contacts_lh.npy", scene.contact_hand.astype(np.float32))
     _save(contacts / "contacts_head_flipped.npy", scene.contact_head[:, human.flip].astype(np.float32))
 
@@ -236,9 +233,9 @@ def write_subject(
         seen = np.random.default_rng([seed, scene.subject.seed, int(camera_name), 59])
         for part, points, verts in (("head", scene.landmarks, scene.head), ("right_hand", scene.joints, scene.hand)):
             keys, boxes = detect(camera, points, verts, seen, noise=keypoint_noise, missing=missing)
-            _save(base / f"{part}_keys" / name / f"{camera_name}.npy", keys)
-            _save(base / f"{part}_bbs" / name / f"{camera_name}.npy", boxes)
-    _write_videos(base, scene, cameras, hair, supersample, codec, seed, workers, progress)
+            _save(subject.keypoints(part, camera_name), keys)
+            _save(subject.boxes(part, camera_name), boxes)
+    _write_videos(subject, scene, cameras, hair, supersample, codec, seed, workers, progress)
 
 
 def detect(
@@ -289,7 +286,7 @@ def _rotations(scene: Scene) -> np.ndarray:
 
 
 def _write_videos(
-    base: Path,
+    subject: DecafSubject,
     scene: Scene,
     cameras: dict[str, Camera],
     hair: str,
@@ -305,7 +302,7 @@ def _write_videos(
     name, figure = scene.subject.name, build_figure(scene, hair)
     lenses = [lens_of(camera, supersample) for camera in cameras.values()]
     resolution = int(np.clip(lenses[0].camera.height, 256, 1024))
-    paths = [(base / "videos" / name / f"{c}.mp4", base / "segmentations" / name / f"{c}.mp4") for c in cameras]
+    paths = [(subject.video(c), subject.matte(c)) for c in cameras]
     with _Videos([p for pair in paths for p in pair], codec) as videos, ThreadPoolExecutor(workers) as pool:
         for n in progress(range(len(scene.head)), f"{name} images", len(scene.head)):
             posed = pose_figure(figure, scene, n)

@@ -5,7 +5,6 @@ import pytest
 
 from nbavatar.data.decaf import (
     check_counts,
-    find_subject,
     frame_counts,
     read_boxes,
     read_camera,
@@ -14,6 +13,7 @@ from nbavatar.data.decaf import (
     read_keypoints,
     read_parameters,
 )
+from nbavatar.data.decaf_files import find_subject
 from nbavatar.errors import DataError
 from nbavatar.io.pickles import read_pickle
 
@@ -54,7 +54,7 @@ def test_a_root_that_is_no_dataset(tmp_path):
 def test_a_camera_without_video_is_named(decaf):
     """As camera 111 of subject S5 in the release: calibrated, but without any video."""
     subject = find_subject(decaf, "S2")
-    subject.file("videos", "100.mp4").unlink()
+    subject.video("100").unlink()
     assert subject.cameras == ["084"]
     with pytest.raises(DataError, match=r"subject S2 has no video 100"):
         read_camera(subject, "100")

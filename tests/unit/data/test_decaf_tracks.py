@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nbavatar.data.decaf import find_subject, read_camera, read_parameters
+from nbavatar.data.decaf import read_camera, read_parameters
+from nbavatar.data.decaf_files import find_subject
 from nbavatar.data.decaf_tracks import build_tracks, frame_id
 from nbavatar.errors import DataError
 from nbavatar.io.pickles import read_pickle
