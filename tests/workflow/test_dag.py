@@ -183,8 +183,11 @@ def test_a_comparison_has_avatars_of_its_own(project, tmp_path):
     (project.folder / "few.json").write_text('{"compare": {"seeds": [0, 1], "minutes": [2, 5]}}')
     files = "config/capture.yaml config/methods.yaml config/compare.yaml few.json"
     jobs = project.plan("--config", root, config=files)
-    # Four variants; what has no shell is trained once more on the meshes without. No report, tables or videos.
-    assert jobs["train"] == 16 and jobs["evaluate"] == 32 and jobs["compare"] == 1 and jobs["shell"] == 1
+    compare = _named(project, "config/compare.yaml")["compare"]
+    trained = 2 * 2 * len(compare["variants"])
+    assert jobs["train"] == trained and jobs["evaluate"] == trained * len(compare.get("protocols", ("nv", "sr")))
+    # One shell serves all variants. No report, tables or videos.
+    assert jobs["compare"] == 1 and jobs["shell"] == 1
     assert not {"table", "figure", "report", "video", "speed"} & jobs.keys()
 
 

@@ -13,7 +13,7 @@ from nbavatar.config.sheets import Row
 from nbavatar.errors import ConfigError
 from nbavatar.planning import units
 from nbavatar.planning.figures import Shown, shown
-from nbavatar.planning.parameters import figure_code, method_of, protocol_text, stage_text
+from nbavatar.planning.parameters import comparison_text, figure_code, method_of, protocol_text, stage_text
 from nbavatar.planning.paths import constraints, fill
 from tests.scenes.capture import write_capture
 from tests.unit.planning.plans import ROOT, shipped
@@ -121,6 +121,17 @@ def test_of_a_single_camera_no_view_is_held_out(tmp_path):
     }
     with pytest.raises(ConfigError, match=r"toy: one camera recorded it.*take a protocol of split self_reenactment"):
         units.judged_on(plan, "toy", "nv")
+
+
+def test_a_comparison_has_rows_of_its_own_and_no_tables(tmp_path):
+    compare = {"variants": ["full"], "steps": [200, 100], "seeds": [0, 1]}
+    plan = _capture(tmp_path, compare=compare)
+    assert plan.compares and not plan.tables and not plan.figures
+    names = [f"full-{steps}steps-seed{seed}" for steps in (100, 200) for seed in (0, 1)]
+    assert [avatar.variant for avatar in units.avatars(plan)] == names, "the smallest budget first"
+    assert len(plan.rows) == len(names) * len(units.judged(plan)) == 8
+    assert units.judged(plan) == [units.Judged("toy", "nv"), units.Judged("toy", "sr")]
+    assert json.loads(comparison_text(plan))["steps"] == [200, 100]
 
 
 def test_figures_show_what_is_made_and_only_their_own_variants():
