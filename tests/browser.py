@@ -39,7 +39,7 @@ class Browser:
         port = self._port(profile / "DevToolsActivePort")
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=30) as answer:
             (page,) = [target for target in json.load(answer) if target["type"] == "page"][:1]
-        self._socket = connect(page["webSocketDebuggerUrl"], max_size=None, open_timeout=30)
+        self._socket = connect(page["webSocketDebuggerUrl"], max_size=None, open_timeout=60, ping_interval=None)
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
         self.call(
