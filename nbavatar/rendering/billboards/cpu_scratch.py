@@ -158,7 +158,7 @@ class Layout(NamedTuple):
 
 
 class Band(NamedTuple):
-    """The band in hand: its pixels on the image, the last row and column excluded; `pixels` of its scratch."""
+    """The current band: its pixels on the image, the last row and column excluded; `pixels` of its scratch."""
 
     left: Any
     right: Any

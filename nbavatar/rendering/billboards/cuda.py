@@ -278,9 +278,9 @@ class _Scene:
                                  found=f"room for {total}", fix="capture the forward pass alone")  # fmt: skip
         s = self.settings
         rows = torch.arange(1, self.down + 1, device=self.device) * TILE
-        behind = ends[rows.clamp_max(s.height) * s.width - 1].tolist()
+        row_ends = ends[rows.clamp_max(s.height) * s.width - 1].tolist()
         groups, first, base, last = [], 0, 0, 0
-        for row, end in enumerate(behind):
+        for row, end in enumerate(row_ends):
             if row > first and end - base > _TAPE:
                 groups.append((first, row - first, base, last - base))
                 first, base = row, last

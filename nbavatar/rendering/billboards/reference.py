@@ -98,12 +98,12 @@ def _blend_pixels(
     plane: Tensor, fade: Tensor, features: Tensor, alpha: Tensor, x: Tensor, y: Tensor, s: BlendSettings
 ) -> tuple[Tensor, Tensor]:
     """Blends n billboards, given in rank order, at P pixels: (C, P) and (P,)."""
-    hit, u, v, w, opacity = _hits(plane, fade, alpha, x, y, s)
+    hit, u, v, w, hit_alpha = _hits(plane, fade, alpha, x, y, s)
     order = _order(w, hit, s.queue)
-    sorted_opacity = opacity if order is None else opacity.gather(0, order)
-    through = torch.cumprod(1.0 - sorted_opacity, 0)
-    through = torch.cat([torch.ones_like(through[:1]), through[:-1]])
-    weight = torch.where(through >= s.t_min, through * sorted_opacity, 0.0)
+    sorted_alpha = hit_alpha if order is None else hit_alpha.gather(0, order)
+    transmittance = torch.cumprod(1.0 - sorted_alpha, 0)
+    transmittance = torch.cat([torch.ones_like(transmittance[:1]), transmittance[:-1]])
+    weight = torch.where(transmittance >= s.t_min, transmittance * sorted_alpha, 0.0)
     if order is not None:
         weight = torch.zeros_like(weight).scatter(0, order, weight)
     samples = _sample(features.permute(0, 3, 1, 2), u, v)
@@ -113,7 +113,7 @@ def _blend_pixels(
 def _hits(
     plane: Tensor, fade: Tensor, alpha: Tensor, x: Tensor, y: Tensor, s: BlendSettings
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Intersections of n billboards with P rays: hit, u, v, inverse depth, opacity, each (n, P)."""
+    """Intersections of n billboards with P rays: hit, u, v, inverse depth, alpha, each (n, P)."""
     px, py = x.double() + 0.5, y.double() + 0.5
     pu, pv, pw = (plane[:, i, 0:1] * px + plane[:, i, 1:2] * py + plane[:, i, 2:3] for i in range(3))
     with torch.no_grad():
@@ -123,9 +123,9 @@ def _hits(
     u, v = torch.where(hit, pu, 0.0) / pw, torch.where(hit, pv, 0.0) / pw
     texel = _sample(alpha[:, None], u, v)[:, 0]
     hit = hit & (texel.detach() >= s.alpha_min)
-    opacity = torch.where(hit, fade[:, None] * texel, 0.0)
-    opacity = torch.where(opacity > s.alpha_max, s.alpha_max, opacity)  # no gradient where capped
-    return hit, u, v, pw.detach(), opacity
+    hit_alpha = torch.where(hit, fade[:, None] * texel, 0.0)
+    hit_alpha = torch.where(hit_alpha > s.alpha_max, s.alpha_max, hit_alpha)  # no gradient where capped
+    return hit, u, v, pw.detach(), hit_alpha
 
 
 def _sample(textures: Tensor, u: Tensor, v: Tensor) -> Tensor:
@@ -176,7 +176,7 @@ def _queue_order(key: Tensor, hit: Tensor, queue: int) -> Tensor:
         give_up((who >= 0).all(0))
     for _ in range(queue):
         give_up((who >= 0).any(0))
-    # candidates that are no hits have opacity 0: they may stand anywhere, each exactly once
+    # candidates that are no hits have alpha 0: they may stand anywhere, each exactly once
     missing = ~hit
     place = filled + torch.cumsum(missing, 0) - 1
     rows = torch.arange(count, device=key.device)[:, None].expand_as(hit)
@@ -207,12 +207,12 @@ def critical_pixels(
         texel = _sample(textures[:, None], u, v)[:, 0]
         close = candidate & ((texel - s.alpha_min).abs() <= tolerance)
         close |= candidate & ((w * s.near - 1.0).abs() <= tolerance) & (texel > 0)
-        hit, _, _, w, opacity = _hits(plane, fade, textures, x, y, s)
+        hit, _, _, w, hit_alpha = _hits(plane, fade, textures, x, y, s)
         order = _order(w, hit, s.queue)
         if order is None:
             order = torch.arange(len(w), device=w.device)[:, None].expand_as(w)
-        through = torch.cumprod(1.0 - opacity.gather(0, order), 0)
-        near_stop = ((through - s.t_min).abs() <= 100 * tolerance * s.t_min) & hit.gather(0, order)
+        transmittance = torch.cumprod(1.0 - hit_alpha.gather(0, order), 0)
+        near_stop = ((transmittance - s.t_min).abs() <= 100 * tolerance * s.t_min) & hit.gather(0, order)
         bad = close.any(0) | near_stop.any(0)
         if s.queue != 0 and len(w) > 1:
             depths = torch.sort(torch.where(hit, w, 0.0), dim=0, descending=True).values

@@ -138,8 +138,8 @@ def project_gaussians(
         x, y = x + screen_offsets[:, 0].double(), y + screen_offsets[:, 1].double()
     form = torch.stack([p, -p * b / c, 1.0 / c.sqrt(), x, y], -1)
     with torch.no_grad():
-        spread = (0.25 * (a - c).square() + b * b).sqrt()
-        radius = SIGMAS * (0.5 * (a + c) + spread).sqrt()
+        half_gap = (0.25 * (a - c).square() + b * b).sqrt()
+        radius = SIGMAS * (0.5 * (a + c) + half_gap).sqrt()
         on_image = (x + radius > 0) & (x - radius < width) & (y + radius > 0) & (y - radius < height)
         radii = torch.where(visible & on_image, radius, 0.0)
     return Projection(form, torch.stack([a, c], -1).detach(), pz.detach(), visible, radii)

@@ -92,13 +92,13 @@ def _alphas(form: Tensor, opacities: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _weights(raw: Tensor, s: SplatSettings) -> tuple[Tensor, Tensor, Tensor]:
-    """Blending weights of alphas (n, P) in order, the transmittances behind them, and which are hits."""
+    """Blending weights of alphas (n, P) in order, the transmittances after them, and which are hits."""
     hit = raw.detach() >= max(s.alpha_min, FAINTEST)
     alpha = torch.where(hit, raw, 0.0)
     alpha = torch.where(alpha > s.alpha_max, s.alpha_max, alpha)  # no gradient where capped
-    behind = torch.cumprod(1.0 - alpha, 0)
-    before = torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
-    return torch.where(behind >= s.t_min, before * alpha, 0.0), behind, hit
+    after = torch.cumprod(1.0 - alpha, 0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    return torch.where(after >= s.t_min, before * alpha, 0.0), after, hit
 
 
 def _blend_pixels(form: Tensor, opacities: Tensor, colours: Tensor, x: Tensor, y: Tensor, s: SplatSettings) -> Tensor:
@@ -125,10 +125,10 @@ def critical_pixels(
     _, box = support_box(projection, opacities * (1 + tolerance), s.alpha_min)
     for members, x, y in pixel_blocks(box, rank, s.width, s.height, 1):
         raw = _alphas(projection.form[members], opacities[members].double(), x, y)
-        _, behind, hit = _weights(raw, s)
+        _, after, hit = _weights(raw, s)
         least = max(s.alpha_min, FAINTEST)
         close = (raw - least).abs() <= tolerance * least
         close |= hit & ((raw - s.alpha_max).abs() <= tolerance * s.alpha_max)
-        close |= hit & ((behind - s.t_min).abs() <= 100 * tolerance * s.t_min)
+        close |= hit & ((after - s.t_min).abs() <= 100 * tolerance * s.t_min)
         critical[y, x] = close.any(0)
     return critical
