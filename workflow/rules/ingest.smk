@@ -16,7 +16,7 @@ if RUN.synthetic:
         params:
             cfg=options("synthesize"),
             code=code_digest("synthesize"),
-            root=RUN.data_root,
+            root=lambda w: RUN.data_root,
         shell:
             "nbavatar synthesize --out {params.root:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
