@@ -74,7 +74,7 @@ def main(args: argparse.Namespace) -> None:
         if plan.moving:
             target["K_per_frame"] = {frame: plan.K[frame].tolist() for frame in frames}
         with FramePackWriter(args.out, target) as out:
-            window = unseen = None
+            window, unseen = None, np.zeros(0, bool)
             for frame in progress(frames, f"crop {manifest['subject']}/{camera.name}", len(frames)):
                 if window is None or (window.x0, window.y0, window.side) != plan.windows[frame]:
                     window = Window(*plan.windows[frame], camera.K, lens)

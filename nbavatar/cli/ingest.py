@@ -64,7 +64,7 @@ def main(args: argparse.Namespace) -> None:
         layers: tuple[str, ...] = ("rgb", "person")
         images = decaf_images(subject, camera, plan)
         names = ("videos", "segmentations", "cameras", "cutIDs")
-        inputs = dict(zip(names, subject.camera_files(args.camera), strict=True))
+        inputs = {str(name): path for name, path in zip(names, subject.camera_files(args.camera), strict=True)}
         report["folder"] = subject.folder
     else:
         capture = open_capture(args.root, pixel_center=cfg.pixel_center)

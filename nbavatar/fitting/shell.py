@@ -280,7 +280,7 @@ def ride(shell: Shell, rest: Rest, verts: np.ndarray) -> np.ndarray:
     weight /= weight.sum(1, keepdims=True)
     result = np.full((len(verts), len(shell.verts), 3), np.nan, np.float32)
     for row in np.flatnonzero(np.isfinite(rest.shift).all(1)):
-        apart = rest.to_rest(row, verts[row]) - rest.verts
+        apart = rest.to_rest(int(row), verts[row]) - rest.verts
         placed = shell.verts + np.einsum("wk,wkc->wc", weight, apart[near])
         result[row] = placed @ rest.rotation[row].T + rest.shift[row]
     return result

@@ -38,7 +38,8 @@ def piece_surface(
     near = scipy.ndimage.binary_dilation(kept, np.ones((3, 3, 3)))
     cell = np.clip(np.floor((verts - grid.low) / grid.edge).astype(int), 0, np.array(grid.shape) - 1)
     wanted = near[cell[:, 0], cell[:, 1], cell[:, 2]]
-    wanted[wanted] = mesh.signed(np.ascontiguousarray(verts[wanted]), np.inf)[0] > gap
+    inside = np.flatnonzero(wanted)
+    wanted[inside] = mesh.signed(np.ascontiguousarray(verts[inside]), np.inf)[0] > gap
     faces = faces[wanted[faces].all(1)]
     if len(faces):
         piece = vertex_components(faces, len(verts))[faces[:, 0]]

@@ -35,7 +35,7 @@ def write_shapes(
     elif suffix == ".ply":
         verts = np.concatenate([shape.positions[0] for shape in shapes]).astype(np.float32)
         colours = np.concatenate([shape.colours for shape in shapes if shape.colours is not None])
-        columns = {axis: verts[:, i] for i, axis in enumerate("xyz")}
+        columns: dict[str, np.ndarray] = {axis: verts[:, i] for i, axis in enumerate("xyz")}
         columns |= {name: colours[:, i] for i, name in enumerate(("red", "green", "blue"))}
         columns["contact"] = np.concatenate(contact).astype(np.uint8)
         write_ply(path, columns, np.concatenate(_numbered(shapes)), [comment])
