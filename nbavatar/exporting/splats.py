@@ -43,7 +43,7 @@ def splat_columns(
     """
     if not isinstance(avatar, GaussianAvatar):
         raise DataError.of(
-            "splats", "method", expected="gaussian_avatars or splatting_avatar", found=avatar.method,
+            "splats", "method", expected="a method of Gaussians", found=avatar.method,
             fix="billboards are no Gaussians: export --to billboards, tensors or decoder",
         )  # fmt: skip
     with torch.no_grad():

@@ -1,5 +1,7 @@
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -43,3 +45,20 @@ def test_training_and_rendering_import_no_geometry_library(verb):
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert out.returncode == 0, out.stderr
     assert out.stdout.strip().splitlines()[-1] == "imported"
+
+
+# Packages that read and write files, and the modules elsewhere that are readers, writers or places of files.
+FILES = ("api.py", "checks", "cli", "config", "data", "io", "planning", "preprocess")
+READERS = {
+    "bodymodels/files.py", "detection/sam3.py", "devices.py", "imports.py", "jit/cache.py", "jit/compile.py",
+    "methods/storage.py", "metrics/lpips.py", "private.py", "provenance.py", "reporting/figures.py",
+    "studies/benchmarks/raster.py", "studies/benchmarks/raster_sweep.py", "studies/tradeoff/presets.py",
+    "studies/tradeoff/sweep.py", "syntax.py", "training/state.py",
+}  # fmt: skip
+
+
+def test_what_computes_takes_no_paths():
+    package = Path(__file__).parents[2] / "nbavatar"
+    elsewhere = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in FILES]
+    with_paths = {p for p in elsewhere if re.search(r"\bPath\b|os\.PathLike", p.read_text(encoding="utf-8"))}
+    assert {path.relative_to(package).as_posix() for path in with_paths} == READERS
