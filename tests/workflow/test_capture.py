@@ -12,7 +12,7 @@ import pytest
 from nbavatar.data.sequences import read_sequence
 from nbavatar.io.framepack import FramePack
 from nbavatar.provenance import file_digest
-from tests.scenes.capture import write_capture
+from tests.scenes.solid import write_solid
 
 ROOT = Path(__file__).parents[2]
 # Sizes and steps of a toy; every other setting is the one that users get.
@@ -44,7 +44,7 @@ def test_a_capture_ends_in_tables_and_a_report(tmp_path: Path) -> None:
     command = [
         sys.executable, "-m", "nbavatar", "warm", "--", "snakemake", "--cores", "2",
         "--configfile", "config/capture.yaml", str(tmp_path / "tiny.json"),
-        "--config", f"data_root={write_capture(tmp_path / 'toy')}",
+        "--config", f"data_root={write_solid(tmp_path / 'toy')}",
     ]  # fmt: skip
     done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]

@@ -141,7 +141,7 @@ def _lasting(tmp_path, environment=None):
         str(tmp_path),
     ]
     server = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
-    until = time.monotonic() + 120.0
+    until = time.monotonic() + 300.0
     family: list[psutil.Process] = []
     while len(family) < 7:  # guard, command, shell, caller, job, two programs
         assert server.poll() is None and time.monotonic() < until, family

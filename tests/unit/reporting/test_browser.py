@@ -89,7 +89,14 @@ def report(tmp_path_factory):
         timings[-1].parent.mkdir(parents=True, exist_ok=True)
         timings[-1].write_text(json.dumps({"device": "cpu: test", "speed": speed}))
         evals.append(folder / f"{variant}.json")
-        content = {"subject": "S2", "variant": variant, "protocol": {"name": "nv1024"}, "per_image": [], "count": 1}
+        content = {
+            "subject": "S2",
+            "variant": variant,
+            "protocol": {"name": "nv1024"},
+            "protocol_hash": "h",
+            "per_image": [],
+            "count": 1,
+        }
         evals[-1].write_text(json.dumps(content | {"metrics": {"psnr": 20.0 + i}, "record": {}}))
     video = folder / "video" / "S2" / "full" / "turntable.mp4"
     with VideoWriter(video, 25) as writer:

@@ -367,7 +367,7 @@ print(time.perf_counter() - start)
 def test_processes_that_start_together_compile_once(tmp_path):
     """Four processes, an empty cache: each set of kernels is announced once, all render, a fifth starts warm."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "OMP_NUM_THREADS": "1"}
-    root = Path(__file__).parents[3]
+    root = Path(__file__).parents[4]
 
     def start():
         return subprocess.Popen([sys.executable, "-c", COMPILE], env=environment, cwd=root, stdout=subprocess.PIPE,

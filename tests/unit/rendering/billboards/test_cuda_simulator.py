@@ -252,7 +252,7 @@ CASES |= {
 def simulated():
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "tests.unit.rendering.billboards.test_cuda_simulator"]
-    done = subprocess.run(command, env=environment, cwd=Path(__file__).parents[3], capture_output=True, text=True,
+    done = subprocess.run(command, env=environment, cwd=Path(__file__).parents[4], capture_output=True, text=True,
                           timeout=600, check=False)  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(done.stdout.splitlines()[-1])
@@ -274,7 +274,7 @@ assert not [name for name in sys.modules if name.startswith("nbavatar.rendering.
 
 
 def test_rendering_on_the_cpu_does_not_load_the_cuda_backend():
-    subprocess.run([sys.executable, "-c", LOADED], cwd=Path(__file__).parents[3], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", LOADED], cwd=Path(__file__).parents[4], check=True, timeout=300)
 
 
 def test_what_is_missing_is_named_in_one_line(monkeypatch):
