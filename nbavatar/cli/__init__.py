@@ -69,26 +69,28 @@ _WITH_TORCH = frozenset({"train", "render", "evaluate", "speed", "tradeoff", "ex
 _OURS = (errno.EBADF, errno.EFAULT, errno.ENOTSOCK)
 
 
-# Options that name files to write. Others that name files which are there are inputs.
-_OUTPUTS = ("out", "history", "overview", "record")
+# Options that name files to write, of all verbs and of single ones. Others that name files which are there are inputs.
+_OUTPUTS = ("out", "history", "overview", "record", "csv", "exr", "picture", "validate")
+_OUTPUTS_OF = {"deform": ("table",), "detect": ("sheet",), "fit": ("sheet",)}
 
 
-def _keep_inputs(parsed: argparse.Namespace) -> None:
+def _keep_inputs(parsed: argparse.Namespace, outputs: Sequence[str]) -> None:
     """Refuses to write a result in the place of an input.
 
     Raises:
         ConfigError: an output is one of the files to read, by whatever name or link.
     """
     options = {name: value if isinstance(value, (list, tuple)) else [value] for name, value in vars(parsed).items()}
-    for output in _OUTPUTS:
+    for output in outputs:
         for out in options.get(output, []):
             if not isinstance(out, (str, os.PathLike)) or not os.path.isfile(out):
                 continue
             for name, values in options.items():
                 given = [value for value in values if isinstance(value, (str, os.PathLike)) and os.path.isfile(value)]
-                if name not in _OUTPUTS and any(os.path.samefile(out, value) for value in given):
+                if name != output and any(os.path.samefile(out, value) for value in given):
                     fix = "name another file: this one would be replaced"
-                    found = f"the input of --{name.replace('_', '-')}"
+                    role = "output" if name in outputs else "input"
+                    found = f"the {role} of --{name.replace('_', '-')}"
                     raise ConfigError.of(out, f"--{output}", expected="a file to write", found=found, fix=fix)
 
 
@@ -119,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         module.add_arguments(own)
         parsed = own.parse_args(arguments[1:])
-        _keep_inputs(parsed)
+        _keep_inputs(parsed, (*_OUTPUTS, *_OUTPUTS_OF.get(verb, ())))
         return module.main(parsed) or 0
     except NBAvatarError as error:
         message = str(error)

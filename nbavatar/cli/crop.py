@@ -14,11 +14,11 @@ over the whole sequence, with a margin (the paper's 512 protocol), or per frame;
 
 import argparse
 import contextlib
+import dataclasses
 from typing import Any
 
 import numpy as np
 
-from nbavatar.camera.pinhole import Camera
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import CropConfig
@@ -28,7 +28,7 @@ from nbavatar.io.framepack import FramePack, FramePackWriter, mark_unseen
 from nbavatar.preprocess.crop import Window, resize_area, resize_labels
 from nbavatar.preprocess.cropping import crop_extent, frame_boxes, plan_crop
 from nbavatar.preprocess.foreground import estimate_foreground
-from nbavatar.preprocess.sources import LAYERS
+from nbavatar.preprocess.sources import LAYERS, camera_of
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
@@ -52,10 +52,9 @@ def main(args: argparse.Namespace) -> None:
         masks = stack.enter_context(FramePack(args.masks)) if args.masks else pack
         _check(pack, masks)
         manifest, frames = pack.manifest, pack.frames
-        lens = manifest.get("distortion") if cfg.undistort else None
-        lens = None if lens is None else np.array(lens, dtype=np.float64)
-        K = pack.intrinsics(frames[0])
-        camera = Camera(manifest["camera"], manifest["width"], manifest["height"], K, pack.cam_from_world, lens)
+        camera = camera_of(pack)
+        if not cfg.undistort:
+            camera = dataclasses.replace(camera, distortion=None)
         boxes, source, missing = None, None, []
         if cfg.kind == "box":
             if not args.meshes:
@@ -77,7 +76,7 @@ def main(args: argparse.Namespace) -> None:
             window, unseen = None, np.zeros(0, bool)
             for frame in progress(frames, f"crop {manifest['subject']}/{camera.name}", len(frames)):
                 if window is None or (window.x0, window.y0, window.side) != plan.windows[frame]:
-                    window = Window(*plan.windows[frame], camera.K, lens)
+                    window = Window(*plan.windows[frame], camera.K, camera.distortion)
                     unseen = window.unseen(camera.height, camera.width, plan.size)
                     out.manifest["unseen"] |= bool(unseen.any())
                 label = window.cut(masks.read("label", frame), labels=True)

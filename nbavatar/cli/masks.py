@@ -33,7 +33,7 @@ from nbavatar.preprocess.capture_masks import CameraMasks, open_masks
 from nbavatar.preprocess.clothes import ClothesModel
 from nbavatar.preprocess.masking import MaskNumbers, MaskStatistics, cut_masks
 from nbavatar.preprocess.part_masks import Margins, PartCutter
-from nbavatar.preprocess.sources import LAYERS, capture_layers, frame_masks
+from nbavatar.preprocess.sources import LAYERS, camera_of, capture_layers, frame_masks
 from nbavatar.preprocess.supplied_masks import supplied_masks
 from nbavatar.provenance import run_record
 
@@ -61,9 +61,7 @@ def main(args: argparse.Namespace) -> None:
     with FramePack(args.frames) as pack:
         manifest, frames = pack.manifest, pack.frames
         sequence.index(frames)
-        K, distortion = pack.intrinsics(frames[0]), manifest.get("distortion")
-        lens = None if distortion is None else np.array(distortion, dtype=np.float64)
-        camera = Camera(manifest["camera"], manifest["width"], manifest["height"], K, pack.cam_from_world, lens)
+        camera = camera_of(pack)
         margins = Margins(cfg.hair_margin, cfg.neck_margin, cfg.hand_margin, cfg.forearm_length)
         cutter = PartCutter(sequence, camera, margins, whole=cfg.keep == "person")
         runs = [frames[first : last + 1] for first, last in manifest.get("segments", [[0, len(frames) - 1]])]

@@ -17,12 +17,9 @@ another part, and what lies outside an image, are no evidence.
 import argparse
 import contextlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from nbavatar.camera.distortion import checked_coefficients
-from nbavatar.camera.pinhole import Camera
 from nbavatar.cli.common import add_cfg_argument, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.geometry import ShellConfig
@@ -35,6 +32,7 @@ from nbavatar.fitting.shell_picture import shell_picture
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.images import encode_png
+from nbavatar.preprocess.sources import camera_of
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
@@ -92,7 +90,7 @@ def _carved(sequence: MeshSequence, packs: list[FramePack], cfg: ShellConfig) ->
     views: list[tuple[int, int]] = []
     cameras = []
     for index, pack in enumerate(packs):
-        cameras.append(_camera(pack))
+        cameras.append(camera_of(pack))
         rows = [row for row in sequence.index(pack.split("train")) if there[row]]
         share = max(1, cfg.views // len(packs))
         few = np.unique(np.linspace(0, len(rows) - 1, min(share, len(rows))).round().astype(int)) if rows else []
@@ -123,12 +121,3 @@ def _carved(sequence: MeshSequence, packs: list[FramePack], cfg: ShellConfig) ->
     if len(shell.faces):  # the skin's own motion, contact too
         rest = rest._replace(verts=rest_of(head.rest, head.faces, head.verts, rows).verts)
     return shell, rest
-
-
-def _camera(pack: FramePack) -> Camera:
-    """The camera of a pack, as its pictures were recorded."""
-    name = str(pack.manifest["camera"])
-    given: Any = pack.manifest.get("distortion")
-    bent = None if given is None or not np.any(given) else checked_coefficients(given, f"{pack.path}: {name}")
-    K = pack.intrinsics(pack.frames[0])
-    return Camera(name, int(pack.manifest["width"]), int(pack.manifest["height"]), K, pack.cam_from_world, bent)

@@ -125,33 +125,36 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
         from nbavatar.metrics.lpips import load_lpips
 
         lpips = load_lpips(net).to(device)
-    folder = RunFolder(f"{args.out}.state", {name: record[name] for name in ("config", "code", "inputs")})
-    if folder.moved_to is not None:
-        print(f"an earlier state belongs to other inputs, options or code; moved to {folder.moved_to}", file=sys.stderr)
-    bar, stop = _Bar(Path(args.out).name), _TerminationFlag()
-    meshes = {part: torch.from_numpy(sequence.parts[part].verts) for part in avatar.parts}
-    summary = train(
-        method,
-        ViewStore(packs, views, avatar.parts, config.cache_mb * 1_000_000),
-        len(views),
-        meshes,
-        lpips,
-        config,
-        folder,
-        device=device,
-        on_step=bar.step,
-        should_stop=stop.is_set,
-    )
-    bar.close()
-    if summary["finished"]:
-        avatar = method.finish(meshes, views)
-        summary["primitives"] = avatar.primitives
-        summary |= {"train_seconds": summary["seconds"], "peak_memory_mb": round(peak_memory_mb(device), 1)}
-        avatar.record = {**record, "summary": summary, "threads": torch.get_num_threads()}
-        if args.history:
-            with atomic_write(args.history) as temporary:
-                temporary.write_bytes((folder.path / "events.jsonl").read_bytes())
-        save_avatar(args.out, avatar)
+    with RunFolder(f"{args.out}.state", {name: record[name] for name in ("config", "code", "inputs")}) as folder:
+        if folder.moved_to is not None:
+            print(
+                f"an earlier state belongs to other inputs, options or code; moved to {folder.moved_to}",
+                file=sys.stderr,
+            )
+        bar, stop = _Bar(Path(args.out).name), _TerminationFlag()
+        meshes = {part: torch.from_numpy(sequence.parts[part].verts) for part in avatar.parts}
+        summary = train(
+            method,
+            ViewStore(packs, views, avatar.parts, config.cache_mb * 1_000_000),
+            len(views),
+            meshes,
+            lpips,
+            config,
+            folder,
+            device=device,
+            on_step=bar.step,
+            should_stop=stop.is_set,
+        )
+        bar.close()
+        if summary["finished"]:
+            avatar = method.finish(meshes, views)
+            summary["primitives"] = avatar.primitives
+            summary |= {"train_seconds": summary["seconds"], "peak_memory_mb": round(peak_memory_mb(device), 1)}
+            avatar.record = {**record, "summary": summary, "threads": torch.get_num_threads()}
+            if args.history:
+                with atomic_write(args.history) as temporary:
+                    temporary.write_bytes((folder.path / "events.jsonl").read_bytes())
+            save_avatar(args.out, avatar)
     return summary
 
 

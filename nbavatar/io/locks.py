@@ -12,7 +12,9 @@ import fcntl
 import logging
 import os
 import weakref
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from nbavatar.errors import DataError
 from nbavatar.io.atomic import no_links
@@ -25,10 +27,24 @@ _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL}
 
 
 class Hold:
-    """A lock that is held while this object and its process live."""
+    """A lock that is held until it is released, at the latest when this object or its process ends."""
 
     def __init__(self, descriptor: int) -> None:
-        self._close = weakref.finalize(self, os.close, descriptor)
+        self._ends = [weakref.finalize(self, os.close, descriptor)]
+
+    def first(self, action: Callable[..., None], *arguments: Any) -> None:
+        """Adds what is to be done at the release, before everything that was added earlier."""
+        self._ends.insert(0, weakref.finalize(self, action, *arguments))
+
+    def release(self) -> None:
+        """Frees the lock now; the second call does nothing.
+
+        An exception that somebody keeps (a notebook, a debugger, a test) keeps the frames of its traceback, and with
+        them every object there: without this the lock of a training that failed would be held until that exception
+        is forgotten.
+        """
+        for end in self._ends:
+            end()
 
 
 def hold(path: str | os.PathLike[str], purpose: str) -> Hold:
@@ -63,7 +79,7 @@ def _hold_by_number(path: Path, purpose: str, lock: Hold) -> None:
         _LOG.warning("%s: this disk has no locks; process %s of another machine is taken to have ended", path, number)
     own = f"{machine()} {os.getpid()}"
     _write(path, own)
-    weakref.finalize(lock, _forget, path, own)
+    lock.first(_forget, path, own)
 
 
 def _forget(path: Path, own: str) -> None:

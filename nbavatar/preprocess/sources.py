@@ -6,16 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
+from nbavatar.camera.distortion import checked_coefficients
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.capture import Capture, read_rgb
 from nbavatar.data.decaf_files import DecafSubject
 from nbavatar.data.frame_plan import FramePlan
 from nbavatar.errors import DataError
+from nbavatar.io.framepack import FramePack
 from nbavatar.io.video import probe_video, read_video
 from nbavatar.preprocess.capture_masks import CameraMasks
 from nbavatar.preprocess.clean import spread_labels
 
-__all__ = ["LAYERS", "capture_images", "capture_layers", "decaf_images", "frame_masks"]
+__all__ = ["LAYERS", "camera_of", "capture_images", "capture_layers", "decaf_images", "frame_masks"]
 
 LAYERS = {
     "rgb": "colour, sRGB, uint8",
@@ -23,6 +25,19 @@ LAYERS = {
     "label": "0 background, 1 head, 2 right hand, 3 left hand",
     "alpha": "coverage of the labelled parts, 0..255",
 }
+
+
+def camera_of(pack: FramePack) -> Camera:
+    """The camera of a pack, with the lens that its pictures were recorded with.
+
+    Raises:
+        DataError: the coefficients of the lens are no finite numbers of a length that OpenCV knows.
+    """
+    name, lens = str(pack.manifest["camera"]), pack.manifest.get("distortion")
+    if lens is not None:
+        lens = checked_coefficients(lens, f"{pack.path}: {name}")
+    K = pack.intrinsics(pack.frames[0])
+    return Camera(name, int(pack.manifest["width"]), int(pack.manifest["height"]), K, pack.cam_from_world, lens)
 
 
 def decaf_images(subject: DecafSubject, camera: Camera, plan: FramePlan) -> Iterator[tuple[str, dict[str, np.ndarray]]]:

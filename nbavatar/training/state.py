@@ -16,7 +16,7 @@ import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ __all__ = ["RunFolder"]
 
 
 class RunFolder:
-    """State of one training run on disk.
+    """State of one training run on disk; a context manager, whose end frees the folder for another training.
 
     Args:
         path: the folder; made when missing.
@@ -58,12 +58,19 @@ class RunFolder:
                     break
             os.replace(self.path, aside)
             self.moved_to = aside
+            self._lock.release()  # it went with the folder
             self._lock = self._claim()
         (self.path / "previews").mkdir(exist_ok=True)
         for leftover in self.path.rglob(".*.tmp*"):  # of a run that was killed while writing
             leftover.unlink(missing_ok=True)
         if not key_file.exists():
             write_json(key_file, dict(key))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
 
     def _claim(self) -> Hold:
         """The lock of the folder, which is made when missing."""

@@ -1,3 +1,5 @@
+import argparse
+import importlib
 import subprocess
 import sys
 
@@ -98,4 +100,28 @@ def test_an_input_is_not_replaced_by_a_result(tmp_path, capsys, link):
         out.symlink_to(given)
     assert cli.main(["spectral", "--meshes", str(given), "--out", str(out)]) == 2
     assert "expected a file to write, found the input of --meshes" in capsys.readouterr().err
+    assert cli.main(["shell", "--masks", "m.zip", "--meshes", str(given), "--out", "s.npz", "--picture", str(out)]) == 2
+    assert "--picture: expected a file to write, found the input of --meshes" in capsys.readouterr().err
     assert given.read_bytes() == b"meshes"
+
+
+# Options that name a file to read; every other option that names a file has to be one that writes it.
+READ = {
+    *("assets", "camera", "cameras", "capture", "cfg", "evals", "extremes", "figures", "flame", "frames", "histories"),
+    *("layout", "masks", "meshes", "model", "models", "photos", "pictures", "presets", "protocol", "render", "renders"),
+    *("reported", "sequences", "source", "spectral", "speeds", "supplied", "tables", "target", "tracks", "tradeoffs"),
+    *("train_frames", "videos"),
+}
+FILES = {"CSV", "EXR", "FILE", "HTML", "JSON", "JSONL", "JSON|FILE", "MP4", "NPZ", "PATH", "PKL", "PNG", "PT", "ZIP"}
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_of_every_option_that_names_a_file_it_is_known_whether_it_is_written(verb):
+    """Otherwise a new one could replace what a user has; see `_keep_inputs`."""
+    parser = argparse.ArgumentParser()
+    importlib.import_module(f"nbavatar.cli.{verb.replace('-', '_')}").add_arguments(parser)
+    written = {*cli._OUTPUTS, *cli._OUTPUTS_OF.get(verb, ())}
+    read = READ | ({"sheet"} if verb == "tradeoff" else set())
+    named = {action.dest for action in parser._actions if action.metavar in FILES and action.option_strings}
+    assert named <= written | read
+    assert not written & read

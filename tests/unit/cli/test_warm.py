@@ -35,11 +35,10 @@ done = subprocess.run([*run, "render", "--model", "absent.pt", *inputs], capture
                       cwd=f"{folder}/elsewhere")
 found["missing"] = done.returncode, done.stdout, done.stderr
 
-# A job that reads a pipe nobody writes to lasts for ever, unless its caller's end ends it.
-os.mkfifo(f"{folder}/model.pt")
+# A job that lasts for minutes, unless its caller's end ends it.
 server = psutil.Process(os.getppid())
 idle = len(server.children())
-caller = subprocess.Popen([*run, "render", "--model", f"{folder}/model.pt", *inputs])
+caller = subprocess.Popen([*run, "extremes", "--out", f"{folder}/extremes"])
 
 
 def jobs_become(number):
@@ -115,13 +114,10 @@ def test_callers_that_stall_or_die_stop_nobody_else(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-# A job that lasts for ever, below a shell as Snakemake's are, and a program of the command's own.
+# A job that lasts for minutes, below a shell as Snakemake's are, and a program of the command's own.
 _LASTING = """
-import os, subprocess, sys
-folder = sys.argv[1]
-os.mkfifo(f"{folder}/model.pt")
-verb = [sys.executable, "-m", "nbavatar", "render", "--model", f"{folder}/model.pt", "--meshes", "a.npz", "--frames",
-        "a.zip", "--out", "out.zip"]
+import subprocess, sys
+verb = [sys.executable, "-m", "nbavatar", "extremes", "--out", f"{sys.argv[1]}/extremes"]
 subprocess.Popen(["bash", "-c", '"$@"; true', "job", *verb])
 subprocess.Popen(["sleep", "1000"])
 subprocess.Popen(["sleep", "1000"]).wait()

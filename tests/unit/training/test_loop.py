@@ -280,6 +280,13 @@ def test_two_trainings_never_share_a_folder(tmp_path) -> None:
     RunFolder(tmp_path / "s", {"a": 1})
 
 
+def test_a_training_that_failed_frees_its_folder_though_somebody_keeps_its_error(tmp_path) -> None:
+    with pytest.raises(RuntimeError) as kept, RunFolder(tmp_path / "s", {}) as held:
+        raise RuntimeError
+    assert kept.value.__traceback__ is not None and held.path.exists()  # as a notebook or a debugger keeps them
+    RunFolder(tmp_path / "s", {})
+
+
 def test_events_after_the_checkpoint_and_torn_lines_are_dropped(tmp_path) -> None:
     folder = RunFolder(tmp_path / "s", {})
     for step in (1, 2, 3):

@@ -6,12 +6,10 @@ The simulator has to be chosen before numba is loaded, so one other process runs
 
 import importlib
 import json
-import os
 import subprocess
 import sys
 import time
 import traceback
-from pathlib import Path
 
 import pytest
 import torch
@@ -22,6 +20,7 @@ from nbavatar.rendering.billboards.projection import project_billboards, texture
 from nbavatar.rendering.billboards.reference import BlendSettings, critical_pixels
 from nbavatar.rendering.ordering import canonical_rank, parse_order
 from tests.unit.rendering.billboards.scenes import OPTIONS, camera, facing, random_billboards, stack
+from tests.unit.rendering.simulation import ROOT, simulate
 
 NAMES = ("means", "quats", "half_extents", "features", "alpha")
 WIDTH, HEIGHT = 19, 13  # two tiles, neither of them whole
@@ -250,12 +249,7 @@ CASES |= {
 
 @pytest.fixture(scope="module")
 def simulated():
-    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "tests.unit.rendering.billboards.test_cuda_simulator"]
-    done = subprocess.run(command, env=environment, cwd=Path(__file__).parents[4], capture_output=True, text=True,
-                          timeout=600, check=False)  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout.splitlines()[-1])
+    return simulate("tests.unit.rendering.billboards.test_cuda_simulator")
 
 
 @pytest.mark.parametrize("name", list(CASES))
@@ -274,7 +268,7 @@ assert not [name for name in sys.modules if name.startswith("nbavatar.rendering.
 
 
 def test_rendering_on_the_cpu_does_not_load_the_cuda_backend():
-    subprocess.run([sys.executable, "-c", LOADED], cwd=Path(__file__).parents[4], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, check=True, timeout=300)
 
 
 def test_what_is_missing_is_named_in_one_line(monkeypatch):

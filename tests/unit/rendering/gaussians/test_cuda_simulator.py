@@ -5,11 +5,7 @@ The simulator has to be chosen before numba is loaded, so one other process runs
 """
 
 import json
-import os
-import subprocess
-import sys
 import traceback
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,6 +15,7 @@ from nbavatar.rendering.gaussians.projection import project_gaussians
 from nbavatar.rendering.gaussians.reference import SplatSettings, critical_pixels
 from nbavatar.rendering.ordering import canonical_rank
 from tests.unit.rendering.gaussians.scenes import NAMES, OPTIONS, camera, random_gaussians, single, stack, turned_camera
+from tests.unit.rendering.simulation import simulate
 
 WIDTH, HEIGHT = 19, 13  # two tiles, neither of them whole
 
@@ -110,12 +107,7 @@ CASES = {name.removeprefix("case_"): case for name, case in list(globals().items
 
 @pytest.fixture(scope="module")
 def simulated():
-    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "tests.unit.rendering.gaussians.test_cuda_simulator"]
-    done = subprocess.run(command, env=environment, cwd=Path(__file__).parents[4], capture_output=True, text=True,
-                          timeout=600, check=False)  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout.splitlines()[-1])
+    return simulate("tests.unit.rendering.gaussians.test_cuda_simulator")
 
 
 @pytest.mark.parametrize("name", list(CASES))
