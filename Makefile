@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 CAPTURE ?=
 TORCH ?= auto
 
-.PHONY: install smoke capture paper test test-fast bench lint format ci lock clean help
+.PHONY: install smoke capture paper rehearsal test test-fast bench lint format ci lock clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -25,6 +25,9 @@ capture: install  ## train and evaluate on your own capture: make capture CAPTUR
 
 paper: install  ## every table of the paper; needs the Decaf dataset and the body models
 	$(BIN)/nbavatar run paper --cores $(CORES)
+
+rehearsal: install  ## the paper on synthetic data of the dataset's size, in few frames and steps; hours on two cores
+	$(BIN)/nbavatar run rehearsal --cores $(CORES)
 
 # One thread a worker: two tests side by side are faster than one after the other on two threads.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES) --dist loadfile

@@ -5,7 +5,8 @@
                                           is any. With --out, writes DIR/CAMERA.png, the meshes over that camera's
                                           images with the masks outlined in yellow, and DIR/overview.png: look at them.
                                           The workflow does this first of all, with --overview and --record.
-  nbavatar check --layout decaf ROOT      lists in one message which files of the dataset and of the body models are
+  nbavatar check --layout decaf ROOT      says in one line what is there of the dataset: whole, partial, packed,
+                                          elsewhere, or nothing; then which files of it and of the body models are
                                           missing, where to get them and where to put them. If none is, reads every
                                           subject and says how far its stored landmarks lie from the projected models,
                                           with and without the lens; with --out, writes DIR/SUBJECT.png.
@@ -24,12 +25,14 @@ import numpy as np
 from nbavatar.checks.capture import CaptureReport, check_capture
 from nbavatar.checks.decaf import SubjectReport, check_subject
 from nbavatar.checks.decaf_inventory import missing_files, missing_message
+from nbavatar.checks.decaf_state import state_line
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import MATTE_THRESHOLD, CheckConfig
+from nbavatar.config.sheets import read_subjects
 from nbavatar.data.capture import read_mesh, read_rgb
 from nbavatar.data.decaf_files import CAMERAS, DecafSubject, find_subject
-from nbavatar.errors import ConfigError, DataError
+from nbavatar.errors import ConfigError, DataError, did_you_mean
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import write_json
@@ -47,10 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
     parser.add_argument("path", metavar="PATH", help="folder of the capture, or of the Decaf dataset")
     parser.add_argument("--layout", choices=("capture", "decaf"), default="capture", help="how the folder is laid out")
-    parser.add_argument(
-        "--subjects", nargs="+", default=["S1", "S2", "S3", "S4"], help="decaf: subjects that are needed"
-    )
+    parser.add_argument("--subjects", nargs="+", help="decaf: subjects that are needed (default: S1 to S4)")
     parser.add_argument("--cameras", nargs="+", default=list(CAMERAS), help="decaf: cameras that are needed")
+    parser.add_argument("--sheet", metavar="TSV", help="decaf: sheet of the subjects and cameras that are needed")
     parser.add_argument("--out", metavar="DIR", help="folder for overlays")
     parser.add_argument("--overview", metavar="PNG", help="capture: one picture of all cameras, if there is no defect")
     parser.add_argument("--record", metavar="JSON", help="capture: what was found, if there is no defect")
@@ -69,9 +71,10 @@ def main(args: argparse.Namespace) -> int:
     """Prints what is wrong; 2 if anything is."""
     root = Path(args.path)
     if args.layout == "decaf":
-        wanted = {s: [c for c in args.cameras if (s, c) != ("S5", "111")] for s in args.subjects}
+        wanted = _wanted(args)
         missing = missing_files(root, wanted)
         if missing:
+            print(f"nbavatar check: error: {state_line(root, wanted, missing)}", file=sys.stderr)
             print(missing_message(root, missing), file=sys.stderr)
             return 2
         return _check_decaf(root, wanted, Path(args.out) if args.out else None)
@@ -105,6 +108,18 @@ def main(args: argparse.Namespace) -> int:
         found |= {"overlap": report.overlap, "astray": report.astray, "folder": os.path.realpath(root)}
         write_json(args.record, run_record("check", config=to_mapping(cfg), inputs=inputs, extra=found))
     return 0
+
+
+def _wanted(args: argparse.Namespace) -> dict[str, list[str]]:
+    """Cameras by subject: of the sheet, or those named; S5 has no camera 111 in the release."""
+    if args.sheet:
+        sheet = read_subjects(args.sheet, args.path)
+        for name in args.subjects or ():
+            if name not in sheet:
+                raise ConfigError(f"{args.sheet}: unknown subject '{name}'; {did_you_mean(name, sheet)}")
+        return {name: list(one.cameras) for name, one in sheet.items() if name in (args.subjects or sheet)}
+    subjects = args.subjects or ["S1", "S2", "S3", "S4"]
+    return {s: [c for c in args.cameras if (s, c) != ("S5", "111")] for s in subjects}
 
 
 def _check_decaf(root: Path, wanted: dict[str, list[str]], out: Path | None) -> int:

@@ -4,9 +4,11 @@
     nbavatar run capture FOLDER      an avatar, metrics, pictures and a report of your own capture
     nbavatar run compare FOLDER      three methods on one or more captures, at several budgets and seeds
     nbavatar run paper               every table of the paper; needs the Decaf dataset and the body models
+    nbavatar run rehearsal           the same on synthetic people of the dataset's size, in few frames and steps
 
-The first call copies the configuration files (`config/`) and the page that says where data belongs
-(`resources/README.md`) into this folder, where you can edit them; files that are there already are left as they are.
+`paper --subjects S2` makes the rows of one subject; with `--subjects S1 S2` later only what is new is made. The first
+call copies the configuration files (`config/`) and the page that says where data belongs (`resources/README.md`) into
+this folder, where you can edit them; files that are there already are left as they are.
 Results go to `results/<run>/`, logs to `logs/<run>/`. The same command again does only what is not done yet. What
 follows `--` goes to snakemake: `-- -n` shows what would run, `-- subject_S2` makes one subject, `-- --configfile FILE`
 takes other options. Configuration files are read first, and refused in one line where they are none. What a run that
@@ -38,21 +40,28 @@ _WHAT = {
     "capture": "train and evaluate an avatar on your own capture",
     "compare": "quality against the time of training, methods side by side, on your own captures",
     "paper": "every table of the paper",
+    "rehearsal": "the paper on synthetic data of the dataset's size, in few frames and steps",
 }
 _OF_CAPTURES = ("capture", "compare")
-_LAYERED = {"compare": ("config/capture.yaml", "config/methods.yaml", "config/compare.yaml")}
+_OF_THE_PAPER = ("paper", "rehearsal")
+_LAYERED = {
+    "compare": ("config/capture.yaml", "config/methods.yaml", "config/compare.yaml"),
+    "rehearsal": ("config/paper.yaml", "config/rehearsal.yaml"),
+}
 _OURSELVES = (sys.executable, "-m", "nbavatar")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
     what = parser.add_subparsers(
-        dest="what", required=True, metavar="smoke|capture|compare|paper", parser_class=_Parser
+        dest="what", required=True, metavar="smoke|capture|compare|paper|rehearsal", parser_class=_Parser
     )
     for name, text in _WHAT.items():
         own = what.add_parser(name, help=text, description=text, epilog="What follows `--` goes to snakemake.")
         if name in _OF_CAPTURES:
             own.add_argument("folder", metavar="FOLDER", help="the capture")
+        if name in _OF_THE_PAPER:
+            own.add_argument("--subjects", nargs="+", metavar="NAME", help="only these (default: all of the sheet)")
         own.add_argument("--cores", type=int, metavar="N", help="processors to use (default: all)")
         own.add_argument("--profile", metavar="NAME", help="where jobs run, if not on this machine: slurm, kubernetes, "
                          "or the folder of a profile of snakemake's")  # fmt: skip
@@ -81,7 +90,8 @@ def main(args: argparse.Namespace) -> int:
         print(f"{path}: written, yours to edit")
     words = _snakemake(args, source)
     if args.what == "paper":
-        check = [*_OURSELVES, "check", "--layout", "decaf", "resources/DecafDataset"]
+        check = [*_OURSELVES, "check", "--layout", "decaf", "resources/DecafDataset", "--sheet", "config/subjects.tsv"]
+        check += ["--subjects", *args.subjects] if args.subjects else []
         code = wait(subprocess.Popen(check))
         if code:
             return code
@@ -123,10 +133,12 @@ def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:
     check_files(given, configfiles, source)
     if not given.configfiles:
         words += ["--configfile", *configfiles]
+    # As quoted texts: snakemake reads values as YAML, where a folder may look like a number. Of two `--config` it takes
+    # the last.
     if args.what in _OF_CAPTURES:
-        # As a quoted text: snakemake reads values as YAML, where a folder may look like a number. Of two `--config`
-        # it takes the last.
         words += ["--config", *given.values, f"data_root={json.dumps(args.folder, ensure_ascii=False)}"]
+    elif args.what in _OF_THE_PAPER and args.subjects:
+        words += ["--config", *given.values, f"only={json.dumps(args.subjects, ensure_ascii=False)}"]
     return words
 
 

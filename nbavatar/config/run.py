@@ -98,6 +98,9 @@ class RunConfig:
         "or else the one best surrounded by others.",
     )
     runs: str = option("config/runs.tsv", "Sheet of what to make: subject, variant, protocol.")
+    only: list[str] = option(
+        [], "Subjects of whom something is made, of those in the sheet of subjects; empty for all of them."
+    )
     tables: str = option("config/tables.yaml", "Layout of the tables.")
     reported: str = option("config/reported.csv", "Numbers printed in the paper.")
     figures: str = option("config/figures.yaml", "Layout of the figures; empty for none.")

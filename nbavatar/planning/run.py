@@ -1,7 +1,7 @@
 """A run as it is planned: its configuration with the sheets and layouts that it names, checked against each other."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nbavatar.config.compare import compared
@@ -67,7 +67,8 @@ def read_plan(mapping: Mapping[str, Any]) -> Plan:
     """Reads a configuration and all sheets and layouts that it names.
 
     Where one camera recorded a subject, none is held out: rows that would judge that camera are left out, and so are,
-    where it is true of every subject, tables and figures that show nothing else.
+    where it is true of every subject, tables and figures that show nothing else. Where only some of the subjects are
+    wanted, the rows, pairs, tables and figures of the others are left out in the same way.
 
     Raises:
         ConfigError: something malformed, a name that is not known, or a dataset of the user's where a synthetic one is
@@ -95,6 +96,15 @@ def read_plan(mapping: Mapping[str, Any]) -> Plan:
     for pair in run.reenact:
         for name in pair.split("/"):
             _check("reenact: unknown subject", name, subjects)
+    if run.only:
+        for name in run.only:
+            _check("only: unknown subject", name, subjects)
+        subjects = {name: subject for name, subject in subjects.items() if name in run.only}
+        rows = [row for row in rows if row.subject in subjects]
+        pairs = [pair for pair in run.reenact if all(name in subjects for name in pair.split("/"))]
+        run = dataclasses.replace(run, reenact=pairs)
+        tables = {name: table for name, table in tables.items() if _shows_one(table, rows)}
+        figures = {name: figure for name, figure in figures.items() if _draws_one(figure, rows, pairs)}
 
     def held(protocol: str) -> bool:
         return _holds_out_view(run.protocols, protocol)
@@ -109,6 +119,28 @@ def read_plan(mapping: Mapping[str, Any]) -> Plan:
 def _check(what: str, name: str, known: Mapping[str, Any]) -> None:
     if name not in known:
         raise ConfigError(f"{what} '{name}'; {did_you_mean(name, known)}")
+
+
+def _shows_one(table: TableLayout, rows: Sequence[Row]) -> bool:
+    """Whether a table has a number of one of the rows; those of the run as a whole always do."""
+    return table.kind in ("speed", "cameras") or any(
+        (row.subject in table.subjects or table.subjects == ["*"])
+        and row.variant in table.variants
+        and row.protocol in table.protocols
+        for row in rows
+    )
+
+
+def _draws_one(figure: FigureLayout, rows: Sequence[Row], pairs: Sequence[str]) -> bool:
+    """Whether a figure has something to draw of the rows and of the pairs source/target of subjects."""
+    if figure.kind == "reenactment":
+        return bool(pairs)
+    return figure.kind == "curves" or any(
+        figure.shows(row.subject)
+        and row.protocol == figure.protocol
+        and (row.variant in figure.variants or not figure.variants)
+        for row in rows
+    )
 
 
 def _holds_out_view(protocols: Mapping[str, ProtocolConfig], protocol: str) -> bool:

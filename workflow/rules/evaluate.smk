@@ -43,6 +43,8 @@ rule evaluate:
         images="results/{run}/eval/{subject}/{variant}/{protocol}.csv",
     log:
         "logs/{run}/eval/{subject}/{variant}/{protocol}.log",
+    benchmark:
+        "benchmarks/{run}/eval/{subject}/{variant}/{protocol}.jsonl"
     threads: 2
     resources:
         mem="16GB",
@@ -68,6 +70,8 @@ rule speed:
         "results/{run}/speed/{subject}/{variant}.json",
     log:
         "logs/{run}/speed/{subject}/{variant}.log",
+    benchmark:
+        "benchmarks/{run}/speed/{subject}/{variant}.jsonl"
     threads: workflow.resource_settings.cores or 4
     resources:
         gpu=1,

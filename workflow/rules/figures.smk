@@ -15,6 +15,8 @@ rule reenact:
         "results/{run}/reenact/{source}/{target}.before.npz",
     log:
         "logs/{run}/reenact/{source}/{target}.log",
+    benchmark:
+        "benchmarks/{run}/reenact/{source}/{target}.jsonl"
     resources:
         mem="8GB",
         runtime="1h",
@@ -38,6 +40,8 @@ rule reenact_contact:
         "results/{run}/reenact/{source}/{target}.npz",
     log:
         "logs/{run}/reenact_contact/{source}/{target}.log",
+    benchmark:
+        "benchmarks/{run}/reenact_contact/{source}/{target}.jsonl"
     threads: 4
     resources:
         mem="8GB",
@@ -64,6 +68,8 @@ rule video:
         record="results/{run}/video/{subject}/{variant}/{kind}.mp4.json",
     log:
         "logs/{run}/video/{subject}/{variant}/{kind}.log",
+    benchmark:
+        "benchmarks/{run}/video/{subject}/{variant}/{kind}.jsonl"
     threads: 4
     resources:
         gpu=1,
@@ -107,6 +113,8 @@ rule figure:
         record="results/{run}/figures/{figure}.json",
     log:
         "logs/{run}/figures/{figure}.log",
+    benchmark:
+        "benchmarks/{run}/figures/{figure}.jsonl"
     resources:
         mem="8GB",
         runtime="30m",

@@ -115,6 +115,8 @@ rule spectral:
         ),
     log:
         "logs/{run}/spectral/{subject}.log",
+    benchmark:
+        "benchmarks/{run}/spectral/{subject}.jsonl"
     priority: 10
     resources:
         mem="4GB",

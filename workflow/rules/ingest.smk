@@ -13,6 +13,8 @@ if RUN.synthetic:
             layouts.dataset(PLAN),
         log:
             f"logs/{RUN.run}/synthesize.log",
+        benchmark:
+            f"benchmarks/{RUN.run}/synthesize.jsonl"
         params:
             cfg=options("synthesize"),
             code=code_digest("synthesize"),
@@ -80,6 +82,8 @@ rule ingest:
         "results/{run}/ingest/{subject}/{camera}.zip",
     log:
         "logs/{run}/ingest/{subject}/{camera}.log",
+    benchmark:
+        "benchmarks/{run}/ingest/{subject}/{camera}.jsonl"
     resources:
         mem="4GB",
         runtime="4h",
@@ -106,6 +110,8 @@ rule tracks:
         "results/{run}/tracks/{subject}.npz",
     log:
         "logs/{run}/tracks/{subject}.log",
+    benchmark:
+        "benchmarks/{run}/tracks/{subject}.jsonl"
     resources:
         mem="8GB",
         runtime="1h",

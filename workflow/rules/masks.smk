@@ -14,6 +14,8 @@ rule masks:
         "results/{run}/masks/{subject}/{camera}.zip",
     log:
         "logs/{run}/masks/{subject}/{camera}.log",
+    benchmark:
+        "benchmarks/{run}/masks/{subject}/{camera}.jsonl"
     resources:
         mem="8GB",
         runtime="4h",
@@ -38,6 +40,8 @@ rule crop:
         "results/{run}/crop/{crop}/{subject}/{camera}.zip",
     log:
         "logs/{run}/crop/{crop}/{subject}/{camera}.log",
+    benchmark:
+        "benchmarks/{run}/crop/{crop}/{subject}/{camera}.jsonl"
     resources:
         mem="4GB",
         runtime="2h",

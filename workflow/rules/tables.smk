@@ -14,6 +14,8 @@ rule collect:
         "results/{run}/results.csv",
     log:
         "logs/{run}/collect.log",
+    benchmark:
+        "benchmarks/{run}/collect.jsonl"
     resources:
         mem="4GB",
         runtime="10m",
@@ -45,6 +47,8 @@ rule table:
         ),
     log:
         "logs/{run}/table/{table}.log",
+    benchmark:
+        "benchmarks/{run}/table/{table}.jsonl"
     resources:
         mem="2GB",
         runtime="10m",
@@ -109,6 +113,8 @@ rule report:
         ),
     log:
         "logs/{run}/report.log",
+    benchmark:
+        "benchmarks/{run}/report.jsonl"
     resources:
         mem="8GB",
         runtime="30m",
@@ -135,6 +141,8 @@ if PLAN.compares:
             files("results/{run}/compare/{subject}_{protocol}.png", units.judged(PLAN)),
         log:
             "logs/{run}/compare.log".format(run=RUN.run),
+        benchmark:
+            "benchmarks/{run}/compare.jsonl".format(run=RUN.run)
         resources:
             mem="2GB",
             runtime="10m",

@@ -32,6 +32,8 @@ rule tradeoff:
         ],
     log:
         "logs/{run}/tradeoff/{subject}/{variant}.log",
+    benchmark:
+        "benchmarks/{run}/tradeoff/{subject}/{variant}.jsonl"
     threads: workflow.resource_settings.cores or 4
     resources:
         gpu=1,
@@ -59,6 +61,8 @@ use rule tradeoff as savings with:
         table="results/{run}/tradeoff/{subject}/{variant}/savings.md",
     log:
         "logs/{run}/tradeoff/{subject}/{variant}.savings.log",
+    benchmark:
+        "benchmarks/{run}/tradeoff/{subject}/{variant}.savings.jsonl"
     resources:
         gpu=1,
         mem="16GB",
@@ -84,6 +88,8 @@ rule offline:
         ),
     log:
         "logs/{run}/tradeoff/{subject}.offline.log",
+    benchmark:
+        "benchmarks/{run}/tradeoff/{subject}.offline.jsonl"
     threads: workflow.resource_settings.cores or 4
     resources:
         mem="16GB",
@@ -116,6 +122,8 @@ rule extremes:
         record="results/{run}/extremes/record.json",
     log:
         "logs/{run}/extremes.log",
+    benchmark:
+        "benchmarks/{run}/extremes.jsonl"
     resources:
         mem="8GB",
         runtime="1h",

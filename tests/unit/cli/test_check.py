@@ -188,3 +188,79 @@ def test_defects_may_be_said_only(capture, tmp_path, capfd):
     assert main(["check", str(capture), "--record", str(record), "--cfg", '{"stop": false}']) == 0
     assert "t1.jpg: expected an image" in json.loads(record.read_text())["defects"][0]
     assert len(errors(capfd)) == 2
+
+
+def _packed(decaf):
+    shutil.make_archive(str(decaf), "zip", decaf.parent, decaf.name)
+    shutil.rmtree(decaf)
+
+
+def _deeper(decaf):
+    shutil.move(decaf, decaf.parent / "unpacked")
+    decaf.mkdir()
+    shutil.move(decaf.parent / "unpacked", decaf / "DecafDataset")
+
+
+def _without_camera(decaf):
+    for path in [*decaf.glob("train/*/S2/100.mp4"), *decaf.glob("train/*/S2/100.npy")]:
+        path.unlink()
+
+
+# What was done to a dataset of which S2 is whole -> what the one line says of it, and whom it was asked for.
+STATES = {
+    "one subject of two": (lambda d: None, ["S2", "S4"], "without S4; what is whole can be run: nbavatar run paper"),
+    "train without test": (lambda d: None, ["S1", "S2"], "without S1 (test/ is not there); what is whole can be run"),
+    "a camera missing": (_without_camera, ["S2"], "S2 lacks camera 100 (a camera that you do not have is left out in"),
+    "a file missing": (lambda d: (d / "train/cutIDs/S2.pkl").unlink(), ["S2"], "found it S2 lacks train/cutIDs/S2.pkl"),
+    "no body models": (lambda d: (d / "assets/generic_model.pkl").unlink(), ["S2"], "it body models missing: FLAME"),
+    "moved": (lambda d: shutil.move(d, d.parent / "elsewhere"), ["S2"], "elsewhere; move it: mv "),
+    "a folder deeper": (_deeper, ["S2"], "found it a folder deeper, in "),
+    "packed": (_packed, ["S2"], "found it still packed; unpack it: unzip "),
+    "nothing": (shutil.rmtree, ["S2"], "found no such folder"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_the_state_of_a_decaf_is_said_in_one_line_before_any_list(decaf, capfd, name):
+    change, subjects, line = STATES[name]
+    shutil.rmtree(decaf / "test", ignore_errors=True)
+    for other in set(path.name for path in decaf.glob("train/videos/*")) - {"S2"}:
+        for path in decaf.glob(f"train/*/{other}"):
+            shutil.rmtree(path)
+    change(decaf)
+    words = ["check", "--layout", "decaf", str(decaf), "--cameras", "084", "100", "--subjects", *subjects]
+    assert main(words) == 2
+    text = capfd.readouterr().err
+    found = [one for one in text.splitlines() if "error:" in one]
+    assert len(found) == 1 and text.startswith(found[0])
+    assert f"{decaf}: expected" in found[0] and line in found[0]
+    assert len(found[0].replace(str(decaf.parent), "")) < 300, "a line that is read"
+
+
+def _cut(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["train/videos/S2/084.mp4", "train/segmentations/S2/084.mp4", "train/params/S2/params_smoothed.pkl",
+     "train/cameras/S2/cameras.pkl", "train/deformations/S2/deforms.npy", "train/head_keys/S2/084.npy",
+     "train/right_hand_bbs/S2/084.npy", "train/contacts/S2/contacts_rh.npy", "train/cutIDs/S2.pkl",
+     "assets/generic_model.pkl", "assets/landmark_embedding.npy", "assets/mano_v1_2/models/MANO_RIGHT.pkl",
+     "assets/accurate_shapes/S2.pkl"],
+)  # fmt: skip
+def test_a_damaged_file_of_a_decaf_is_named_in_one_line(decaf, capfd, name):
+    _cut(decaf / name)
+    assert main(["check", "--layout", "decaf", str(decaf), "--subjects", "S2", "--cameras", "084", "100"]) == 2
+    found = errors(capfd)
+    assert any(name in line for line in found), found
+    assert len({line for line in found if "frames" not in line}) <= 3
+
+
+def test_a_decaf_is_asked_for_what_the_sheet_names(decaf, tmp_path, capfd):
+    sheet = tmp_path / "subjects.tsv"
+    sheet.write_text("subject\ttrain_cameras\ttest_camera\nS2\t084\t100\nS1\t084,110\t100\n")
+    words = ["check", "--layout", "decaf", str(decaf), "--sheet", str(sheet)]
+    assert main([*words, "--subjects", "S2"]) == 0
+    assert main([*words, "--subjects", "S9"]) == 2
+    assert "unknown subject 'S9'" in errors(capfd)[0]

@@ -189,3 +189,17 @@ def test_planning_imports_the_standard_library_and_yaml_alone():
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert out.returncode == 0, out.stderr
     assert set(out.stdout.split()) <= {"nbavatar", "yaml", "_yaml"}
+
+
+def test_some_of_the_subjects_have_their_rows_tables_and_figures_and_no_others():
+    whole, alone, two = shipped("paper"), shipped("paper", only=["S1"]), shipped("paper", only=["S1", "S2"])
+    assert {row.subject for row in alone.rows} == {"S1"} and set(alone.subjects) == {"S1"}
+    assert alone.rows == [row for row in whole.rows if row.subject == "S1"]
+    assert two.rows == [row for row in whole.rows if row.subject in ("S1", "S2")]
+    assert alone.run.reenact == [] and two.run.reenact == ["S1/S2"]
+    # What the paper shows of S2 alone is not made of S1.
+    assert set(whole.tables) - set(alone.tables) == {"ablation", "cost", "channels"}
+    assert set(whole.figures) - set(alone.figures) == {"ablation", "channels", "cross_reenactment"}
+    assert set(two.tables) == set(whole.tables) and set(two.figures) == set(whole.figures)
+    with pytest.raises(ConfigError, match="only: unknown subject 'S9'"):
+        shipped("paper", only=["S9"])
