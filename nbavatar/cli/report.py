@@ -1,4 +1,4 @@
-"""One self-contained HTML page: tables, comparison pictures, training curves, provenance.
+"""One self-contained HTML page: truth, render and error at a glance, tables, pictures, training curves, provenance.
 
     --tables     tables (.md, and .csv to download); a .csv without its .md is shown as it is
     --evals      results of `nbavatar evaluate` (.json): figures under the pictures, provenance
@@ -37,6 +37,7 @@ from nbavatar.io.images import decode_image
 from nbavatar.io.records import read_record
 from nbavatar.reporting.comparison import Rendered, compare_frames, to_strip
 from nbavatar.reporting.markdown import markdown_to_html
+from nbavatar.reporting.opening import opening_of
 from nbavatar.reporting.page import (
     curves_section,
     page,
@@ -84,10 +85,14 @@ def main(args: argparse.Namespace) -> int:
         renders = read_renders([stack.enter_context(FramePack(path)) for path in args.renders], evals)
         crops = [stack.enter_context(FramePack(path)) for path in args.frames]
         comparisons = compare_frames(renders, crops, frames=cfg.frames)
+        judged = {(e["subject"], e["variant"], e["protocol"]["name"]): e for _, e in evals}
+        opening = opening_of(renders, crops, judged, _turntables(args.videos, cfg), max_side=cfg.max_side)
     strips = {
         f"{subject}, protocol {protocol}": [to_strip(comparison, max_side=cfg.max_side) for comparison in group]
         for (subject, protocol), group in comparisons.items()
     }
+    videos = [_video(path, args.out, cfg) for path in args.videos]
+    played = {opening.film} if opening else set()
     histories = read_histories(args.histories)
     pictures = [(_is_figure(path), _picture(path, cfg)) for path in args.pictures]
     measured = [(Path(path).stem, content) for path, content in speeds]
@@ -98,13 +103,13 @@ def main(args: argparse.Namespace) -> int:
         ("tradeoff", "Speed against accuracy", "\n".join(_sweep(Path(path), cfg) for path in args.tradeoffs)),
         ("extremes", "Kernels at their limits", "\n".join(_limits(Path(path), cfg) for path in args.extremes)),
         ("figures", "Figures", pictures_section([picture for figure, picture in pictures if figure])),
-        ("videos", "Videos", videos_section([_video(path, args.out, cfg) for path in args.videos])),
+        ("videos", "Videos", videos_section([video for video in videos if video[1] not in played])),
         ("training", "Training", _training(args.histories, histories, cfg)),
         ("stages", "Geometry", pictures_section([picture for figure, picture in pictures if not figure])),
         ("provenance", "Provenance", provenance_section([*evals, *speeds]) if evals or speeds else ""),
     ]
     with atomic_write(args.out) as path:
-        path.write_text(page(cfg.title, args.size_label, sections), encoding="utf-8")
+        path.write_text(page(cfg.title, args.size_label, sections, opening), encoding="utf-8")
     print(f"{args.out}: {Path(args.out).stat().st_size / 1e6:.1f} MB")
     return 0
 
@@ -240,14 +245,30 @@ def beside(path: Path, page_path: Path) -> str:
     return "./" + quote(os.fsencode(os.path.relpath(path, page_path.parent).replace(os.sep, "/")))
 
 
+def _turntables(names: list[str], cfg: ReportConfig) -> dict[tuple[str, str], str]:
+    """(subject, variant) -> address of its turntable, of those that are put into the page."""
+    found = {}
+    for path in map(Path, names):
+        if path.stem == "turntable" and len(path.parts) > 2 and _video_size(path) <= cfg.video_mb * 1e6:
+            found[path.parts[-3], path.parts[-2]] = _video_uri(path)
+    return found
+
+
+def _video_size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError as error:
+        raise DataError.of(path, expected="a video (.mp4)", found="no such file") from error
+
+
+def _video_uri(path: Path) -> str:
+    return "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+
+
 def _video(name: str, page_path: str, cfg: ReportConfig) -> tuple[str, str, bool]:
     """Title, address, and whether the address holds the video itself (or leads to the file)."""
     path = Path(name)
     title = " ".join(part for part in path.parts[-3:-1] if part not in ("", "/")) + f" {path.stem}"
-    try:
-        size = path.stat().st_size
-    except FileNotFoundError as error:
-        raise DataError.of(name, expected="a video (.mp4)", found="no such file") from error
-    if size > cfg.video_mb * 1e6:
+    if _video_size(path) > cfg.video_mb * 1e6:
         return title, beside(path, Path(page_path)), False
-    return title, "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode("ascii"), True
+    return title, _video_uri(path), True

@@ -18,8 +18,8 @@ from nbavatar.reporting.markdown import markdown_to_html
 from nbavatar.reporting.pareto import COSTS, QUALITIES, measured_variants, scatter_chart
 from nbavatar.reporting.pictures import ERROR_MAX, RAMP
 
-__all__ = ["Card", "Strip", "curves_section", "page", "pictures_section", "provenance_section", "strips_section"]
-__all__ += ["pareto_section", "tables_section", "videos_section"]
+__all__ = ["Card", "Opening", "Strip", "curves_section", "opening_section", "page", "pictures_section"]
+__all__ += ["pareto_section", "provenance_section", "strips_section", "tables_section", "videos_section"]
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,44 @@ class Strip:
 
     title: str
     cards: Sequence[Card]
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What the page opens with.
+
+    Attributes:
+        text: whose pictures and figures they are.
+        cards: truth, render and error of one image.
+        figures: (name, value, direction) of the metrics that matter.
+        film: address of a turntable that the page plays; empty if there is none.
+        small: enlarge the film without smoothing.
+    """
+
+    text: str
+    cards: Sequence[Card]
+    figures: Sequence[tuple[str, str, str]]
+    film: str = ""
+    small: bool = False
+
+
+def opening_section(opening: Opening | None) -> str:
+    """A strip that is understood at a glance; empty if there is nothing to show."""
+    if opening is None:
+        return ""
+    shots = [_card(card, f"opening-{i}") for i, card in enumerate(opening.cards)]
+    if opening.film:
+        small = ' class="small"' if opening.small else ""
+        film = f'<video{small} autoplay loop muted playsinline controls src="{opening.film}" aria-label="turntable">'
+        caption = "<figcaption><b>Turntable</b><br>one pose, seen around</figcaption>"
+        shots.append(f"<figure>{caption}{film}</video></figure>")
+    values = "".join(
+        f"<div><dt>{html.escape(name)}</dt><dd>{value}</dd><dd>{html.escape(direction)}</dd></div>"
+        for name, value, direction in opening.figures
+    )
+    figures = f"<dl>{values}</dl>" if values else ""
+    strip = f'<div class="shots">{"".join(shots)}</div>'
+    return f'<section id="opening">\n{strip}\n{figures}\n<p>{html.escape(opening.text)}</p>\n</section>'
 
 
 def tables_section(tables: Mapping[str, tuple[str, str]]) -> str:
@@ -228,13 +266,14 @@ def provenance_section(results: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
     return table + f"<tbody>{''.join(rows)}</tbody></table></div>" + "\n".join(details)
 
 
-def page(title: str, label: str, sections: Sequence[tuple[str, str, str]]) -> str:
+def page(title: str, label: str, sections: Sequence[tuple[str, str, str]], opening: Opening | None = None) -> str:
     """The whole page.
 
     Args:
         title: heading of the page.
         label: a warning shown at its top, such as that sizes are not the paper's; may be empty.
         sections: (id, heading, HTML) in order; sections without content are left out.
+        opening: what stands before them.
     """
     here = files("nbavatar.reporting")
     style = here.joinpath("page.css").read_text(encoding="utf-8")
@@ -248,7 +287,7 @@ def page(title: str, label: str, sections: Sequence[tuple[str, str, str]]) -> st
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
         f"<title>{html.escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<h1>{html.escape(title)}</h1>\n{warning}\n<nav>{links}</nav>\n<main>\n{body}\n</main>\n"
+        f"<h1>{html.escape(title)}</h1>\n{warning}\n{opening_section(opening)}\n<nav>{links}</nav>\n<main>\n{body}\n</main>\n"
         f"<script>\n{script}</script>\n</body>\n</html>\n"
     )
 

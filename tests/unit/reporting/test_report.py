@@ -138,7 +138,39 @@ def test_page_shows_truth_renders_errors_masks_and_figures(run):
         "PSNR on the training view", "PSNR [dB]", "Training preview of S2/full", "abcdef012345", "ablation.csv",
     ):  # fmt: skip
         assert words in text, words
-    assert "frame 0002" not in text
+    assert "frame 0002" not in text.partition('<section id="pictures">')[2], "the opening may show another frame"
+
+
+def test_page_opens_with_truth_render_error_turntable_and_three_figures(run):
+    folder, options = run
+    judged = json.loads(Path(options["--evals"][1]).read_text())
+    for row, value in zip(judged["per_image"], (30.0, 10.0, 22.0, 21.0, 25.0, 12.0), strict=True):
+        row["psnr"] = value  # of six, the lower of the middle two is 21, that of frame 0003
+    judged["metrics"] = {"psnr": 20.004, "ssim": 0.91234, "lpips_vgg": None, "lpips_alex": 0.1}
+    Path(options["--evals"][1]).write_text(json.dumps(judged))
+    film = folder / "video/S2/no_nb/turntable.mp4"
+    film.parent.mkdir(parents=True)
+    film.write_bytes(b"a film")
+    options |= {"--videos": [*options["--videos"], str(film)]}
+    text = build(folder, options)
+    opening = text.partition('<section id="opening">')[2].partition("</section>")[0]
+    assert text.index('id="opening"') < text.index("<nav>") < text.index('id="tables"')
+    # Both have truth and figures; the one with a turntable stands for the run.
+    assert "no_nb of S2, protocol nv1024, camera 102, frame 0003: the image of median PSNR" in opening
+    assert re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd><dd>(.*?)</dd>", opening) == [
+        ("PSNR [dB]", "20.00", "higher is better"),
+        ("SSIM", "0.912", "higher is better"),
+        ("LPIPS, AlexNet", "0.100", "lower is better"),
+    ]
+    assert [image["alt"].partition(" ")[0] for image in Page(opening).all("img")] == ["Truth", "Render", "Error"]
+    (played,) = Page(opening).all("video")
+    assert played["src"].startswith("data:video/mp4") and {"autoplay", "loop", "muted", "controls"} <= set(played)
+    assert text.count(played["src"]) == 1, "what the opening plays is not put into the page again"
+    alone = build(folder, {"--renders": options["--renders"]})
+    opening = alone.partition('<section id="opening">')[2].partition("</section>")[0]
+    assert [image["alt"].partition(" ")[0] for image in Page(opening).all("img")] == ["Render"]
+    assert "<dl>" not in opening and "<video" not in opening and "median" not in opening
+    assert 'id="opening"' not in build(folder, {"--evals": options["--evals"]})
 
 
 def test_every_part_may_be_missing(run):
