@@ -23,7 +23,7 @@ if "run" not in config:
 report: "workflow/report/workflow.rst"
 
 
-container: "docker://ghcr.io/nbavatar/nbavatar:0.1.0"
+container: "docker://ghcr.io/nbavatar/nbavatar:0.2.0"
 
 
 include: "workflow/rules/common.smk"
