@@ -8,6 +8,10 @@ BIN := $(VENV)/bin
 CAPTURE ?=
 TORCH ?= auto
 
+# Container images often set it. Without byte code every command compiles all that it imports, which takes it longer than
+# to import torch: it is written once, into .venv and beside our own modules.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: install smoke capture paper rehearsal test test-fast bench lint format ci lock clean help
 
 help:  ## list the targets

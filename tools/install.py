@@ -81,7 +81,11 @@ def main() -> int:
         return fail("pip could not install this package itself (its message is above)")
     shutil.rmtree(venv / "torch", ignore_errors=True)
 
-    if subprocess.run([str(venv / "bin" / "nbavatar"), "doctor", "--brief"], check=False).returncode:
+    # It imports every package, and so their byte code is made, which every later command finds: also where a container's
+    # image says that none is to be written, and for users who may not write here.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    doctor = [str(venv / "bin" / "nbavatar"), "doctor", "--brief"]
+    if subprocess.run(doctor, check=False, env=environment).returncode:
         return fail("the environment does not work, see the line above; after mending it, run the same command again")
     stamp.write_text(json.dumps({"locks": digest(), "torch": kind}), encoding="utf-8")
     say(f"installed in {args.venv} in {time.monotonic() - start:.0f} s")

@@ -269,10 +269,13 @@ def test_which_torch_is_taken(installer, monkeypatch, tmp_path, wish, driver, cp
 def test_an_environment_that_does_not_work_is_never_called_installed(installer, monkeypatch, tmp_path, capsys):
     """The last step, `nbavatar doctor --brief`, fails: exit code 1, one line, no stamp."""
     venv = tmp_path / "venv"
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
 
-    def run(command, **_):
+    def run(command, env=None, **_):
         if "venv" in command:
             (venv / "bin").mkdir(parents=True)
+        if "doctor" in command:  # its imports leave byte code for all later commands
+            assert env["PATH"] and "PYTHONDONTWRITEBYTECODE" not in env
         return subprocess.CompletedProcess(command, 2 if "doctor" in command else 0, "", "")
 
     class Done:
@@ -287,6 +290,13 @@ def test_an_environment_that_does_not_work_is_never_called_installed(installer, 
     said = capsys.readouterr()
     assert "error: the environment does not work" in said.err and len(said.err.strip().splitlines()) == 1
     assert "MB" in said.out and not (venv / ".installed").exists()
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make")
+def test_commands_of_the_makefile_write_byte_code(monkeypatch):
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    show = ["make", "--no-print-directory", "--eval", "show:; @echo [$$PYTHONDONTWRITEBYTECODE]", "show"]
+    assert subprocess.check_output(show, cwd=ROOT, text=True) == "[]\n"
 
 
 def test_another_python_is_refused_in_one_line(installer, monkeypatch, capsys):
