@@ -19,6 +19,7 @@ With --json the same as one JSON object:
 
 import argparse
 import ast
+import functools
 import importlib
 import importlib.metadata
 import importlib.util
@@ -72,20 +73,26 @@ def main(args: argparse.Namespace) -> int:
 
 def third_party(verb: str) -> set[str]:
     """Top-level names of the packages outside the standard library that a verb's code imports, anywhere in it."""
-    names: set[str] = set()
-    for module in code_modules(verb):
-        spec = importlib.util.find_spec(module)
-        if spec is None or spec.origin is None:
-            continue
-        for node in ast.walk(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                names.update(alias.name.partition(".")[0] for alias in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-                names.add(node.module.partition(".")[0])
-            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "require" and node.args:
-                if isinstance(node.args[0], ast.Constant):
-                    names.add(str(node.args[0].value).partition(".")[0])
+    names = set[str]().union(*map(_imported, code_modules(verb)))
     return {name for name in names if name not in sys.stdlib_module_names and name != "nbavatar"}
+
+
+@functools.cache  # most verbs share most modules
+def _imported(module: str) -> frozenset[str]:
+    """Top-level names of the packages that a module's code imports, anywhere in it."""
+    names: set[str] = set()
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        return frozenset()
+    for node in ast.walk(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module.partition(".")[0])
+        elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "require" and node.args:
+            if isinstance(node.args[0], ast.Constant):
+                names.add(str(node.args[0].value).partition(".")[0])
+    return frozenset(names)
 
 
 def examine(root: Path) -> dict[str, Any]:
