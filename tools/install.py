@@ -81,7 +81,7 @@ def main() -> int:
         return fail("pip could not install this package itself (its message is above)")
     shutil.rmtree(venv / "torch", ignore_errors=True)
 
-    # It imports every package, and so their byte code is made, which every later command finds: also where a container's
+    # It imports every package, and so their byte code is made, which all later commands find: also where a container's
     # image says that none is to be written, and for users who may not write here.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     doctor = [str(venv / "bin" / "nbavatar"), "doctor", "--brief"]
