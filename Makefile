@@ -33,8 +33,9 @@ paper: install  ## every table of the paper; needs the Decaf dataset and the bod
 rehearsal: install  ## the paper on synthetic data of the dataset's size, in few frames and steps; hours on two cores
 	$(BIN)/nbavatar run rehearsal --cores $(CORES)
 
-# One thread a worker: two tests side by side are faster than one after the other on two threads.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES) --dist loadfile
+# One thread a worker: two tests side by side are faster than one after the other on two threads. Files are begun in the
+# order of tests/conftest.py, long ones first, not by how many tests they hold.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CORES) --dist loadfile --no-loadscope-reorder
 
 test: install  ## all tests, as in CI
 	$(PYTEST)

@@ -18,8 +18,16 @@ settings.register_profile(
 settings.load_profile("nbavatar")
 
 
+_WHOLE_RUNS = ("workflow", "cluster")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skips tests marked `gpu` where there is no CUDA device; this is the only place that does."""
+    """Files that take long come first; tests marked `gpu` are skipped where there is no CUDA device, only here.
+
+    A worker of pytest-xdist takes a whole file: one of a minute that is begun last keeps all others waiting.
+    """
+    long = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: (item.path.parent.name not in _WHOLE_RUNS, item.path not in long))
     marked = [item for item in items if item.get_closest_marker("gpu")]
     if not marked:
         return

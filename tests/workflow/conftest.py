@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.workflow import imported
+
 ROOT = Path(__file__).parents[2]
 # Creates whatever a rule's command is asked to write, notes its words in `calls`, and does nothing else.
 STUB = """#!/bin/bash
@@ -71,10 +73,8 @@ class Project:
 
     def snakemake(self, *words: str, config: str = "config/smoke.yaml") -> subprocess.CompletedProcess[str]:
         """Runs snakemake in the folder; configuration files are separated by spaces, later ones win."""
-        command = [sys.executable, "-m", "snakemake", "--cores", "2", "--configfile", *config.split(), *words]
-        return subprocess.run(
-            command, cwd=self.folder, env=self.environment, capture_output=True, text=True, timeout=300
-        )
+        command = ["--cores", "2", "--configfile", *config.split(), *words]
+        return imported.snakemake(command, self.folder, self.environment)
 
     def plan(self, *words: str, config: str = "config/smoke.yaml") -> dict[str, int]:
         """Rule -> number of jobs that a dry run would start."""
