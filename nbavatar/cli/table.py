@@ -60,6 +60,7 @@ def main(args: argparse.Namespace) -> int:
         read_results(files),
         printed_source=Source(args.reported, file_digest(args.reported)),
         lpips_net=cfg.lpips_net,
+        difference=cfg.difference,
         size_label=args.size_label,
     )
     record = run_record("table", config={"table": args.table} | to_mapping(cfg), inputs=inputs)

@@ -77,6 +77,12 @@ class TableConfig:
         "The others are in the csv.",
         choices=("alex", "vgg"),
     )
+    difference: str = option(
+        "comparable",
+        "Where the difference from the paper's printed numbers stands: beside results that are comparable, or beside "
+        "all of the paper's image sizes (a rehearsal), which the caption then says.",
+        choices=("comparable", "size"),
+    )
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from nbavatar.methods.registry import METHODS
 from nbavatar.reporting.cells import COLUMNS, Source, plain
 from nbavatar.reporting.printed import deviating_marks, deviating_means
 
-__all__ = ["describe_deviations", "describe_few_steps", "describe_protocol", "describe_speeds", "describe_trainings"]
+__all__ = ["describe_deviations", "describe_difference", "describe_few_steps", "describe_protocol"]
+__all__ += ["describe_speeds", "describe_trainings"]
 
 _SPLITS = {
     "novel_view": "training frames in the held-out camera",
@@ -102,6 +103,14 @@ def describe_few_steps(layout: TableLayout, results: Sequence[tuple[Mapping[str,
     if not steps or max(steps) >= _FEW_STEPS or layout.kind == "cameras":
         return ""
     return f"{max(steps):,} training steps rank nothing: they show that every stage runs, not which method is better."
+
+
+def describe_difference(label: str) -> str:
+    """What a difference from printed numbers may be read as where the reproduced ones are not comparable."""
+    return (
+        f"Differences are between unlike things (here: {label}): they show that every printed number has its "
+        "counterpart, and say nothing of how well the paper is reproduced."
+    )
 
 
 def describe_deviations(layout: TableLayout, panel: Panel, printed: pd.DataFrame) -> list[str]:

@@ -19,6 +19,7 @@ import pandas as pd
 from nbavatar.config.tables import TIMED, TRAINED, Panel, TableLayout, TableRow
 from nbavatar.reporting.captions import (
     describe_deviations,
+    describe_difference,
     describe_few_steps,
     describe_protocol,
     describe_speeds,
@@ -44,6 +45,7 @@ def build_table(
     printed_source: Source,
     lpips_net: str = "vgg",
     size_label: str = "",
+    difference: str = "comparable",
 ) -> Table:
     """One table of the paper.
 
@@ -55,6 +57,7 @@ def build_table(
         printed_source: file and digest of the printed numbers.
         lpips_net: backbone shown in the LPIPS columns.
         size_label: if not empty, nothing reproduced is comparable with the paper, and this is the reason.
+        difference: `size` for the difference from printed numbers wherever images are of the paper's size.
 
     Raises:
         DataError: two results answer for the same cell.
@@ -72,15 +75,18 @@ def build_table(
         found = _reproduced(layout, grid, numbers, results)
         if panel.reported:
             own = [_printed(layout, panel, grid, printed, printed_source)]
-            reasons = size_label or _other_sizes(layout, found)
+            sizes = _other_sizes(layout, found)
+            reasons = size_label or sizes
             if reasons:
                 remark = f"{reasons}; not comparable with the paper"
                 own.append(found.assign(heading=f"Reproduced ({remark})", comparable=False))
                 notes.append(f"Reproduced numbers: {remark}.")
             else:
                 own.append(found.assign(heading="Reproduced", comparable=True))
-                difference = _difference(layout, *own)
-                own += [difference] if any(difference["text"]) else []
+            if not reasons or (difference == "size" and not sizes):
+                apart = _difference(layout, *own)
+                own += [apart] if any(apart["text"]) else []
+                notes += [describe_difference(size_label)] if reasons and any(apart["text"]) else []
         else:
             own = [found.assign(heading=size_label or "Results", comparable=False)]
         own.append(_unseen(layout, panel, numbers).assign(comparable=all(block["comparable"].all() for block in own)))

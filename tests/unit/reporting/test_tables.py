@@ -105,6 +105,20 @@ def test_what_is_not_comparable_is_labelled_and_never_subtracted(tmp_path, size,
     assert caption and f"{label}; not comparable with the paper" in caption.group(1)
 
 
+def test_a_rehearsal_stands_beside_the_paper_and_its_caption_says_what_the_difference_is_worth(tmp_path):
+    extra = ("--size-label", "rehearsal", "--cfg", '{"difference": "size"}')
+    path = evaluation(tmp_path, "S2", "full", "nv1024", 1024, psnr=33.0)
+    cells, markdown, latex = make(tmp_path, "novel_view_1024", [path], (), *extra)
+    assert cells["", "difference", "Ours", "S2.psnr"]["text"] == "+4.37"  # 33.00 - 28.63
+    assert cells["", "difference", "Ours", "S2.psnr"]["comparable"] == "no"
+    sentence = "Differences are between unlike things (here: rehearsal)"
+    assert markdown.count(sentence) == 1 and latex.count(sentence) == 1
+    # Images of another size are never subtracted.
+    small = evaluation(tmp_path, "S2", "full", "nv1024", 64, psnr=33.0)
+    cells, markdown, _ = make(tmp_path, "novel_view_1024", [small], (), *extra)
+    assert {key[1] for key in cells} == {"printed", "reproduced"} and sentence not in markdown
+
+
 def test_means_need_every_subject_and_are_recomputed(tmp_path):
     values = {"S1": 27.001, "S2": 28.002, "S3": 23.003, "S4": 24.005}
     paths = [evaluation(tmp_path, s, "full", "nv1024", 1024, psnr=v) for s, v in values.items()]
