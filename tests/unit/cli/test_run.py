@@ -216,3 +216,25 @@ def test_configuration_is_not_written_through_a_link_that_waits_for_it(tmp_path)
     run.copy_configuration(ROOT, tmp_path / "here")
     assert notes.read_text() == "mine"
     assert not (tmp_path / "here/config/smoke.yaml").is_symlink()
+
+
+def test_the_rehearsal_lies_over_the_paper_and_subjects_are_chosen_as_text(calls, tmp_path, monkeypatch):
+    import yaml
+
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "rehearsal", "--cores", "2"]) == 0
+    assert calls[-1][-3:] == ["--configfile", "config/paper.yaml", "config/rehearsal.yaml"] and "warm" not in calls[-1]
+    assert main(["run", "rehearsal", "--subjects", "S2", "007", "--", "--config", "device=cpu"]) == 0
+    assert calls[-1][-3:-1] == ["--config", "device=cpu"]
+    key, _, value = calls[-1][-1].partition("=")
+    assert key == "only" and yaml.safe_load(value) == ["S2", "007"]
+
+
+def test_the_paper_is_checked_for_the_subjects_that_are_wanted(calls, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    checked = []
+    monkeypatch.setattr(run, "wait", lambda process: 0)
+    monkeypatch.setattr(run.subprocess, "Popen", checked.append)
+    assert main(["run", "paper", "--subjects", "S2"]) == 0
+    assert checked[0][-4:] == ["--sheet", "config/subjects.tsv", "--subjects", "S2"]
+    assert calls[-1][-1] == 'only=["S2"]'
