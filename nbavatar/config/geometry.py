@@ -91,7 +91,7 @@ class ShellConfig:
         min=0.0, max=1.0,
     )  # fmt: skip
     spread_deg: float = option(
-        40.0, "Views whose directions differ by less than this tell no depth: nothing is carved [degrees].",
+        35.0, "Three views have to differ from each other by so much in direction to tell depth [degrees].",
         min=0.0, max=180.0,
     )  # fmt: skip
     margin: float = option(2.0, "How far around the mesh hair is looked for [radius].", min=0.1, max=10.0)

@@ -237,12 +237,18 @@ def _interleaved(count: int) -> np.ndarray:
 
 
 def _spread(poses: Sequence[np.ndarray], middle: np.ndarray) -> float:
-    """Largest angle between the directions from which cameras see the middle [degrees]; 0 of fewer than two."""
-    if len(poses) < 2:
+    """How far apart are three directions from which cameras see the middle: the least of their angles [degrees].
+
+    Two directions alone, however far apart, leave a wedge where their silhouettes cross, which no mask contradicts. The
+    three are the two that are farthest apart and the one that is farthest from both; 0 where there are fewer views.
+    """
+    if len(poses) < 3:
         return 0.0
     centres = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses]) - middle
     towards = centres / np.maximum(np.linalg.norm(centres, axis=1, keepdims=True), 1e-12)
-    return float(np.degrees(np.arccos(np.clip(towards @ towards.T, -1.0, 1.0)).max()))
+    angles = np.degrees(np.arccos(np.clip(towards @ towards.T, -1.0, 1.0)))
+    ends = np.unravel_index(angles.argmax(), angles.shape)
+    return float(angles[list(ends)].min(0).max())
 
 
 def carried(shell: Part, head: Part, verts: np.ndarray) -> Part:

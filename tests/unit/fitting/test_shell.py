@@ -126,6 +126,15 @@ def test_nothing_is_made_where_nothing_reaches_out_or_depth_is_unknown() -> None
     assert not len(Solid(cameras=1).carve()[0].faces)
 
 
+def test_two_directions_however_far_apart_tell_no_depth() -> None:
+    """The wedge where two silhouettes cross is contradicted by no mask; a third camera between them cuts it."""
+    two = Solid(cameras=2, arc=90.0).carve()[0]  # carved, the ball would be 0.23 m too long in the median
+    assert "too alike" in two.said["absent"] and two.said["spread_deg"] < 35
+    solid = Solid(cameras=3, arc=90.0)
+    three = solid.carve()[0]
+    assert three.said["spread_deg"] > 60 and np.abs(solid.error(three)).max() < 0.02
+
+
 def test_counts_equal_a_plain_loop(rng) -> None:
     grid = grid_over(np.array([-0.2, -0.1, -0.15]), np.array([0.2, 0.2, 0.15]), 0.05, 10_000)
     views = []
