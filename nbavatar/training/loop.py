@@ -5,6 +5,7 @@ checkpoint computes the same bits as an unbroken one (on the CPU, with the same 
 gradients are not finite is skipped and counted; several in a row end the training with one line.
 """
 
+import contextlib
 import math
 import time
 from collections import OrderedDict
@@ -21,6 +22,7 @@ from nbavatar.errors import NBAvatarError
 from nbavatar.methods.base import MeshAvatar, Method
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import Plan
+from nbavatar.training.determinism import sums_in_order
 from nbavatar.training.preview import contact_sheet
 
 __all__ = ["Store", "train"]
@@ -117,7 +119,7 @@ def train(
         )
 
     avatar.train()
-    try:
+    with contextlib.closing(stream), sums_in_order(device):
         while not clock.done(step):
             if should_stop is not None and should_stop():
                 checkpoint()
@@ -169,8 +171,6 @@ def train(
                 checkpoint()
                 saved_at = time.monotonic()
         checkpoint()
-    finally:
-        stream.close()
     avatar.eval()
     return _summary(True, step, clock, skipped, last, count, views, avatar)
 
