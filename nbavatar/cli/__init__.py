@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from nbavatar import __version__
 from nbavatar.errors import ConfigError, NBAvatarError, describe, did_you_mean
 from nbavatar.packages import distribution_of, install_line
+from nbavatar.waiting import wait_briefly
 
 __all__ = ["SOCKET_VARIABLE", "VERBS", "main"]
 
@@ -97,6 +98,7 @@ def _keep_inputs(parsed: argparse.Namespace, outputs: Sequence[str]) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one verb; returns the exit code (0 done, 2 bad input or usage, 130 interrupted)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    wait_briefly()
     parser = _top_parser()
     if not arguments or arguments[0].startswith("-"):
         parser.parse_args(arguments)

@@ -6,6 +6,7 @@
     nbavatar bench spectral  spectral coordinates of a head and hands
     nbavatar bench fit       multi-view refit, frames a second and millimetres
     nbavatar bench train     one training step, part by part
+    nbavatar bench waiting   training steps whose threads wait for each other in two ways, in turns
 
 Times depend on the machine and on what else it does: compare figures of one run only.
 """
@@ -15,9 +16,12 @@ import importlib
 import json
 import sys
 
+from nbavatar.cli.run import pipeline_folder
+
 __all__ = ["add_arguments", "main"]
 
-_KERNELS = ("raster", "splat", "deform", "spectral", "fit", "train")
+_OF_CAPTURES = ("waiting",)  # measure a capture's training unless another run is named
+_KERNELS = ("raster", "splat", "deform", "spectral", "fit", "train", "waiting")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,6 +43,8 @@ def main(args: argparse.Namespace) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")
     module.add_arguments(parser)
     options = parser.parse_args(args.rest)
+    if args.kernel in _OF_CAPTURES and options.config is None:
+        options.config = str(pipeline_folder() / "config/capture.yaml")
     figures = module.run(options)
     if options.json:
         json.dump(figures, sys.stdout, indent=1, sort_keys=True)

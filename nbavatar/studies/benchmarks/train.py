@@ -2,6 +2,7 @@
 
     nbavatar bench train --json
     nbavatar bench train --size 512 --width 16 --convs 1 --device cpu
+    nbavatar bench train --size 256 --config config/capture.yaml     # as that run trains; sizes are its own
 
 One avatar of a full-size head and hand (11,514 billboards of FLAME and MANO), one view of --size pixels whose window
 is the whole picture. Each part is run alone, forward and backward, on the same tensors as in the step; the sum of the
@@ -11,9 +12,10 @@ over all threads (`*_cpu_ms`), which other programs disturb less; `raster_and_da
 """
 
 import argparse
+import dataclasses
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,27 +23,21 @@ import torch
 from torch import Tensor
 
 from nbavatar.config.training import TrainConfig
-from nbavatar.data.synthetic.scene import full_scene
-from nbavatar.data.views import Sample, View
 from nbavatar.devices import device_name, lease_device, peak_memory_mb
 from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.losses import loss_delta, loss_knn
 from nbavatar.methods.billboards.options import BillboardsConfig, UNetConfig
 from nbavatar.methods.billboards.region import full_region, shift_camera
-from nbavatar.methods.billboards.training import BillboardTraining
-from nbavatar.methods.create import create_method
-from nbavatar.metrics.lpips import load_lpips
-from nbavatar.optimization.adam import Adam
-from nbavatar.optimization.schedule import plan_at
+from nbavatar.methods.photometric import loss_dssim, loss_l1
 from nbavatar.rendering.billboards.functional import render_billboards
+from nbavatar.studies.benchmarks.step_scene import FRAME, StepScene, training_options
 
 __all__ = ["add_arguments", "run"]
-
-_FRAME = "f"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the model's and the measurement's options."""
+    parser.add_argument("--config", metavar="YAML", help="run whose training it is, such as config/capture.yaml")
     parser.add_argument("--size", type=int, default=512, help="image side [px] (default: %(default)s)")
     parser.add_argument("--width", type=int, default=48, help="U-Net width (default: %(default)s, the paper's)")
     parser.add_argument("--convs", type=int, default=2, help="U-Net convolutions a level (default: %(default)s)")
@@ -60,7 +56,35 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _measure(args: argparse.Namespace, device: str) -> dict[str, Any]:
-    config = TrainConfig(
+    config = _options(args)
+    scene = StepScene(args.size, config, device)
+    method, plan = scene.method, scene.plan()
+    parts = _parts(scene, min(config.lpips_crop, args.size))
+    figures: dict[str, Any] = {
+        "device": device_name(device),
+        "threads": torch.get_num_threads(),
+        "size": args.size,
+        "billboards": method.avatar.primitives,
+        "unet_width": config.billboards.unet.width,
+        "perceptual_crop": plan.crop,
+    }
+    scene.step()
+    for name, call in {**parts, "step": scene.step}.items():
+        figures[f"{name}_ms"], figures[f"{name}_cpu_ms"] = _median(call, args.repeats, device)
+    for name in parts:
+        figures[f"{name}_share"] = figures[f"{name}_cpu_ms"] / sum(figures[f"{other}_cpu_ms"] for other in parts)
+    figures["raster_and_data_to_unet"] = (figures["raster_share"] + figures["data_share"]) / figures["unet_share"]
+    figures["peak_mb"] = peak_memory_mb(device)
+    return figures
+
+
+def _options(args: argparse.Namespace) -> TrainConfig:
+    """Those of a run's file where one is named, else the paper's with the sizes that are asked for."""
+    if args.config is not None:
+        config = training_options(args.config)
+        own = dataclasses.replace(config.billboards, roi=False, precision=args.precision)
+        return dataclasses.replace(config, billboards=own)
+    return TrainConfig(
         lpips_crop=args.lpips_crop,
         schedule="paper",
         billboards=BillboardsConfig(
@@ -71,78 +95,17 @@ def _measure(args: argparse.Namespace, device: str) -> dict[str, Any]:
             precision=args.precision,
         ),
     )
-    method, sample, verts = _scene(args.size, config, device)
-    lpips = load_lpips(config.lpips_net).to(device)
-    plan = plan_at(0.5, config, args.size)
-    optimizer = Adam(method.parameter_groups())
-    anchor = method.avatar.anchor(verts, _FRAME)
-
-    def step() -> None:
-        optimizer.zero_grad()
-        random = torch.Generator().manual_seed(0)
-        method.step_loss(sample, anchor, lpips, plan, random).total.backward()
-        optimizer.step()
-
-    parts = _parts(method, sample, verts, lpips, optimizer, min(args.lpips_crop, args.size))
-    figures: dict[str, Any] = {
-        "device": device_name(device),
-        "threads": torch.get_num_threads(),
-        "size": args.size,
-        "billboards": method.avatar.primitives,
-        "unet_width": args.width,
-        "perceptual_crop": plan.crop,
-    }
-    step()
-    for name, call in {**parts, "step": step}.items():
-        figures[f"{name}_ms"], figures[f"{name}_cpu_ms"] = _median(call, args.repeats, device)
-    for name in parts:
-        figures[f"{name}_share"] = figures[f"{name}_cpu_ms"] / sum(figures[f"{other}_cpu_ms"] for other in parts)
-    figures["raster_and_data_to_unet"] = (figures["raster_share"] + figures["data_share"]) / figures["unet_share"]
-    figures["peak_mb"] = peak_memory_mb(device)
-    return figures
 
 
-def _scene(size: int, config: TrainConfig, device: str) -> tuple[BillboardTraining, Sample, Mapping[str, Tensor]]:
-    """Method in its initial state, a view whose avatar fills the picture, and the meshes of its frame."""
-    sequence = full_scene(4, dents=False)
-    verts = {name: torch.from_numpy(part.verts[2]).float() for name, part in sequence.parts.items()}
-    points = torch.cat(list(verts.values()))
-    centre, extent = (points.amax(0) + points.amin(0)) / 2, float((points.amax(0) - points.amin(0)).max())
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.tensor(
-        [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-    )  # z is up, the face looks to -y
-    viewmat[:3, 3] = -viewmat[:3, :3] @ centre + torch.tensor([0.0, 0.0, 4.0 * extent])
-    focal = 3.6 * size
-    K = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    view = View(0, "camera", _FRAME, 2, size, size, K, viewmat)
-    random = torch.Generator().manual_seed(0)
-    pixels = torch.rand((5, size, size), generator=random)
-    pixels[3], pixels[4] = 1.0, 0.0
-    method = create_method(sequence, {}, [view], config, device)
-    assert isinstance(method, BillboardTraining)
-    method.avatar.train()
-    return (
-        method,
-        Sample(view, pixels, 0, 0, size, size, K),
-        {name: values.to(device) for name, values in verts.items()},
-    )
-
-
-def _parts(
-    method: BillboardTraining,
-    sample: Sample,
-    verts: Mapping[str, Tensor],
-    lpips: Callable[[Tensor, Tensor], Tensor],
-    optimizer: Adam,
-    crop: int,
-) -> dict[str, Callable[[], None]]:
+def _parts(scene: StepScene, crop: int) -> dict[str, Callable[[], None]]:
     """Each part of a step, forward and backward, on tensors of its own."""
+    method, sample, verts = scene.method, scene.sample, scene.verts
+    lpips, options = scene.lpips, method.options
     avatar: Avatar = method.avatar
     device = avatar.faces.device
     side = sample.width
     view, K = sample.view.viewmat.to(device), sample.K.to(device)
-    posed, _ = avatar.pose(verts, _FRAME)
+    posed, _ = avatar.pose(verts, FRAME)
     fixed = [value.detach().requires_grad_(True) for value in (*posed, *avatar.textures())]
     region = full_region(side, side, avatar.multiple)
     stored = (sample.pixels.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
@@ -167,26 +130,27 @@ def _parts(
         (values.sum() + opacity.sum()).backward()
 
     def decode() -> None:
-        colour, opacity = avatar.decode(features, alpha, method.config.own.precision)
+        colour, opacity = avatar.decode(features, alpha, options.precision)
         (colour.sum() + opacity.sum()).backward()
 
     def meshes() -> None:
-        avatar.place(avatar.anchor(verts, _FRAME))[0].means.sum().backward()
+        avatar.place(avatar.anchor(verts, FRAME))[0].means.sum().backward()
 
     def regularise() -> None:
-        placed, _ = avatar.pose(verts, _FRAME)
+        placed, _ = avatar.pose(verts, FRAME)
         assert method.neighbours is not None
         (loss_knn(*placed, method.neighbours) + loss_delta(avatar.billboards.mu)).backward()
 
-    return {
-        "data": data,
-        "meshes": meshes,
-        "raster": draw,
-        "unet": decode,
-        "lpips": lambda: lpips(image, truth).sum().backward(),
-        "regularisers": regularise,
-        "optimizer": optimizer.step,
-    }
+    def compare() -> None:
+        (options.weight_l1 * loss_l1(picture, target) + options.weight_dssim * loss_dssim(picture, target)).backward()
+
+    parts = {"data": data, "meshes": meshes, "raster": draw, "unet": decode, "regularisers": regularise}
+    if options.weight_dssim > 0:
+        picture, target = torch.rand((3, side, side), device=device, requires_grad=True), sample.pixels[:3].to(device)
+        parts["colours"] = compare
+    if lpips is not None:
+        parts["lpips"] = lambda: lpips(image, truth).sum().backward()
+    return {**parts, "optimizer": scene.optimizer.step}
 
 
 def _median(call: Callable[[], None], repeats: int, device: str) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 import argparse
 import importlib
+import os
 import subprocess
 import sys
 
@@ -7,6 +8,7 @@ import pytest
 
 from nbavatar import cli
 from nbavatar.errors import DataError
+from nbavatar.waiting import SPINS, VARIABLES
 
 
 def run(*words):
@@ -126,3 +128,18 @@ def test_of_every_option_that_names_a_file_it_is_known_whether_it_is_written(ver
     named = {action.dest for action in parser._actions if action.metavar in FILES and action.option_strings}
     assert named <= written | read
     assert not written & read
+
+
+@pytest.mark.parametrize("own", [None, ("OMP_WAIT_POLICY", "active"), ("GOMP_SPINCOUNT", "7")])
+def test_threads_wait_briefly_from_before_torch_is_loaded_unless_the_user_says_how(own):
+    code = (
+        "import os, sys; from nbavatar.cli import main; main(['trian'])\n"
+        "assert 'torch' not in sys.modules; print(os.environ.get('GOMP_SPINCOUNT'))"
+    )
+    environment = {name: value for name, value in os.environ.items() if name not in VARIABLES}
+    environment |= dict([own] if own else [])
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )  # fmt: skip
+    expected = {None: str(SPINS), "OMP_WAIT_POLICY": "None", "GOMP_SPINCOUNT": "7"}[own and own[0]]
+    assert out.stdout.strip() == expected
