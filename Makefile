@@ -49,6 +49,9 @@ bench: install  ## benchmarks of the kernels
 	$(BIN)/nbavatar bench spectral
 	$(BIN)/nbavatar bench fit
 
+docs: install  ## the documentation as a site: build/docs/docs/index.html
+	$(BIN)/python -m sphinx -W --keep-going -q -c docs . build/docs
+
 lint: install  ## formatting, style, types, layers, workflow
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -62,7 +65,7 @@ format: install  ## format Python and Snakemake files
 	$(BIN)/ruff format .
 	$(BIN)/snakefmt Snakefile workflow
 
-ci: lint  ## what CI runs
+ci: lint docs  ## what CI runs
 	$(MAKE) smoke
 	$(MAKE) test
 

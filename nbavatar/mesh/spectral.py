@@ -29,11 +29,11 @@ class SpectralCoordinates:
     """Eigenfunctions of a mesh with V vertices and P components, K channels.
 
     Attributes:
-        coords: one channel per mode, scaled to max |value| = 1 within each component, (V, K) float64 [dimensionless].
-            0 at unreferenced vertices and in channels that a small component does not have.
+        coords: one channel per mode, scaled within each component to a largest ``|value|`` of 1, (V, K) float64
+            [dimensionless]; 0 at unreferenced vertices and in channels that a small component does not have.
         eigenvalues: (P, K) float64 [1/m^2], ascending; inf where a component has no such mode.
         component: component of each vertex, (V,) int64, -1 for unreferenced vertices.
-        residual: |L phi - lambda M phi| / |lambda M phi| in the norm of M^-1, (P, K) float64 [dimensionless].
+        residual: ``|L phi - lambda M phi| / |lambda M phi|`` in the norm of M^-1, (P, K) float64 [dimensionless].
         group: near-degenerate group of each mode, (P, K) int64: equal numbers mean eigenvalues that are too close to
             tell their functions apart.
     """

@@ -41,7 +41,7 @@ def relax(
         pose: (H, 6) correction of each hand: translation [m], rotation vector [rad] about `centre` (H, 3) [m].
         pose_inverse_mass: (H, 2) [1/kg], [1/(kg m^2)]; `pose_stiffness` (2,) [N/m], [N m]; `pose_bound` (2,) [m],
             [rad]. The hand points given hold for the pose at entry.
-        dt: time step [s]. iterations: at least 1. friction: Coulomb coefficient. max_dent: limit of |x - rest| [m].
+        dt: time step [s]. iterations: at least 1. friction: Coulomb coefficient. max_dent: limit of ``|x - rest|`` [m].
 
     Returns:
         Normal impulse of each contact, (C,) [kg m]: force times dt^2.

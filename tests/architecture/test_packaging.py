@@ -34,6 +34,9 @@ UNIMPORTED = {
     "pytest-xdist": "pytest -n",
     "jaxtyping": "shapes in annotations, checked by beartype",
     "beartype": "checks the annotations in tests",
+    "sphinx": "a command",
+    "myst-nb": "an extension of sphinx, named in docs/conf.py",
+    "furo": "a theme of sphinx, named in docs/conf.py",
     "ruff": "a command",
     "snakefmt": "a command",
     "pyright": "a command",
@@ -51,6 +54,8 @@ UNDECLARED = {
     "packaging": "comes with pytest; tests only",
     "websockets": "comes with viser; tests only",
     "llvmlite": "comes with numba, of the version that numba needs",
+    "nbclient": "comes with myst-nb; tests only",
+    "nbformat": "comes with myst-nb; tests only",
     "setuptools": "builds the package",
     "importlinter": "import-linter's package",
 }
@@ -69,13 +74,16 @@ def installer():
     return _load("install", ROOT / "tools" / "install.py")
 
 
-def _pins(name: str) -> dict[str, str]:
+def _pins(name: str, *, here: bool = False) -> dict[str, str]:
+    """Locked versions; `here`: of packages for this Python and system only."""
     pins = {}
     for line in (ROOT / name).read_text(encoding="utf-8").splitlines():
         if line and not line.startswith("#"):
             requirement = Requirement(line)
             (specifier,) = requirement.specifier
             assert specifier.operator == "==", line
+            if here and requirement.marker and not requirement.marker.evaluate():
+                continue
             pins[canonicalize_name(requirement.name)] = specifier.version
     return pins
 
@@ -89,7 +97,7 @@ def _declared(*extras: str) -> list[Requirement]:
 
 def test_the_lock_holds_every_declared_package_in_a_version_that_fits():
     base, gpu = _pins("requirements.lock"), _pins("requirements-cuda.lock")
-    for requirement in _declared("pipeline", "view", "export", "completion", "test", "lint"):
+    for requirement in _declared("pipeline", "view", "export", "completion", "docs", "test", "lint"):
         assert requirement.specifier.contains(base[canonicalize_name(requirement.name)]), requirement
     for requirement in _declared("cuda")[len(PROJECT["dependencies"]) :]:
         assert requirement.specifier.contains(gpu[canonicalize_name(requirement.name)]), requirement
@@ -101,8 +109,8 @@ def test_the_lock_has_what_the_installed_packages_ask_for():
     """Complete, as `--no-deps` needs it to be: what every locked package requires is locked, in a version that fits."""
     from importlib import metadata
 
-    base = _pins("requirements.lock")
-    for name in base:
+    base, here = _pins("requirements.lock"), _pins("requirements.lock", here=True)
+    for name in here:
         for line in metadata.requires(name) or []:
             requirement = Requirement(line)
             if requirement.marker and not requirement.marker.evaluate({"extra": ""}):
