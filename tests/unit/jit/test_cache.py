@@ -122,6 +122,44 @@ def test_a_full_disk_keeps_nothing_and_stops_nothing(package):
     assert "cannot be kept" in told
 
 
+# Three processes that reach `prepare` together, whose compiling lasts.
+TOGETHER = """
+import pathlib, sys, time
+from numba import types
+from nbavatar.doubling import kernel
+from nbavatar.jit import compile
+
+def slowly(kernels, quickly=compile._compile):
+    time.sleep(0.5)
+    quickly(kernels)
+
+compile._compile = slowly
+here = pathlib.Path(sys.argv[1])
+(here / sys.argv[2]).touch()
+while len(list(here.iterdir())) < 3:
+    time.sleep(0.01)
+compile.prepare("doubling", {kernel.twice: (types.int64,)})
+kernel.main()
+"""
+
+
+def test_of_processes_that_start_together_one_compiles(package, tmp_path):
+    """It says so, once; the others wait for what it has compiled."""
+    (tmp_path / "here").mkdir()
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(package.parent)
+    command = [sys.executable, "-c", TOGETHER, str(tmp_path / "here")]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    started = [
+        subprocess.Popen([*command, str(number)], cwd=package.parent, env=environment, **streams) for number in range(3)
+    ]
+    results = [process.communicate(timeout=300) for process in started]
+    assert sorted(out.split()[:2] for out, _ in results) == [["42", "0"], ["42", "1"], ["42", "1"]], results
+    assert sorted(told.count("compiling the doubling kernels") for _, told in results) == [0, 0, 1]
+    hits, _, told = run(package)
+    assert hits == 1 and "compiling" not in told
+
+
 def test_what_another_user_prepared_is_passed_over(public_folder, monkeypatch, caplog):
     """The other has made the folders that we would use, closed and open, and a link to one of the victim's."""
     from nbavatar import private

@@ -1,10 +1,7 @@
 """The CPU kernels against the reference: values, gradients, determinism, extremes, resources."""
 
 import os
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +11,7 @@ from hypothesis import strategies as st
 
 from nbavatar.errors import DataError, DeviceError
 from nbavatar.rendering import binning
-from nbavatar.rendering.billboards import cpu, cpu_blend, render_billboards
+from nbavatar.rendering.billboards import cpu, cpu_blend, cpu_projection, render_billboards
 from nbavatar.rendering.billboards.projection import project_billboards, texture_support
 from nbavatar.rendering.billboards.reference import BlendSettings, blend_reference, critical_pixels
 from nbavatar.rendering.ordering import canonical_rank, parse_order
@@ -353,30 +350,21 @@ def test_a_scene_that_does_not_fit_says_so_before_allocating(monkeypatch):
     assert time.perf_counter() - start < 20
 
 
-COMPILE = """
-import sys, time, torch
-from nbavatar.rendering.billboards import render_billboards
-from tests.unit.rendering.billboards.scenes import camera, random_billboards
-start = time.perf_counter()
-render_billboards(*random_billboards(0, 3, 2, 1, torch.float32), *camera(), 40, 30)
-print(time.perf_counter() - start)
-"""
-
-
-@pytest.mark.slow
-def test_processes_that_start_together_compile_once(tmp_path):
-    """Four processes, an empty cache: each set of kernels is announced once, all render, a fifth starts warm."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "OMP_NUM_THREADS": "1"}
-    root = Path(__file__).parents[4]
-
-    def start():
-        return subprocess.Popen([sys.executable, "-c", COMPILE], env=environment, cwd=root, stdout=subprocess.PIPE,
-                                stderr=subprocess.PIPE, text=True)  # fmt: skip
-
-    results = [process.communicate() for process in [start() for _ in range(4)]]
-    announced = sorted(line for _, stderr in results for line in stderr.splitlines() if "compiling" in line)
-    assert len(announced) == 2 and "float32" in announced[0] and "projection" in announced[1], results
-    assert all(float(stdout) > 0 for stdout, _ in results)
-    stdout, stderr = start().communicate()
-    assert "compiling" not in stderr
-    assert float(stdout) < min(float(first) for first, _ in results)
+def test_every_kernel_is_prepared_as_it_is_called(monkeypatch):
+    """`prepare` has one process of many compile; what is called with other types is compiled by each of them again."""
+    sets: dict[str, dict] = {}
+    for module in (cpu, cpu_projection):
+        monkeypatch.setattr(module, "prepare", lambda name, kernels: sets.setdefault(name, kernels))
+    cpu_projection._prepare.__wrapped__()
+    for dtype in (torch.float32, torch.float64):
+        cpu.prepare_kernels(dtype)
+        scene = [tensor.requires_grad_() for tensor in random_billboards(0, 3, 2, 1, dtype)]
+        image, opacity = render_billboards(*scene, *camera(dtype=dtype), 40, 30, backend="cpu")
+        (image.sum() + opacity.sum()).backward()
+    declared: dict = {}
+    for kernels in sets.values():
+        for dispatcher, signature in kernels.items():
+            declared.setdefault(dispatcher, set()).add(signature)
+    assert len(sets) == 3 and len(declared) == 9
+    for dispatcher, signatures in declared.items():
+        assert set(dispatcher.signatures) == signatures, dispatcher.py_func.__name__

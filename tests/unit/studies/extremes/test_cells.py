@@ -1,5 +1,6 @@
 """Every cell keeps its verdict: at its quick levels, and, by random levels between, along its axis."""
 
+import functools
 import math
 
 import pytest
@@ -10,11 +11,16 @@ from nbavatar.studies.extremes.cells import FAMILIES, cells
 from nbavatar.studies.extremes.verdict import measure
 
 
+@functools.cache  # quick levels are levels, too
+def judged(cell, level):
+    return measure(cell, level)
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_no_defect_at_the_quick_levels(family):
     for cell in cells((family,)):
         for level in cell.quick:
-            row = measure(cell, level)
+            row = judged(cell, level)
             assert row.verdict != "defect", f"{cell.name} at {level}: {row.message} ({row.forward}, {row.gradient})"
 
 
@@ -89,7 +95,7 @@ def test_no_defect_at_any_level(family):
         f"{cell.name} at {level}: {row.message} ({row.forward}, {row.gradient})"
         for cell in cells((family,))
         for level in cell.levels
-        for row in [measure(cell, level)]
+        for row in [judged(cell, level)]
         if row.verdict == "defect"
     ]
     assert not defects, "\n".join(defects)
