@@ -59,16 +59,16 @@ def run_workflow(
 
     Args:
         snakemake: the command, such as `[sys.executable, "-m", "snakemake", "--cores", "2"]`.
-        warm: run it below `nbavatar warm`.
+        warm: run it below `nbavatar warm`, if it has jobs.
         slurm: its jobs go to SLURM.
         folder: Snakemake's working folder; must be the current one unless the command says otherwise.
 
     Raises:
         DataError: another run works in the folder, or a lock is there of which nobody knows whose it is.
     """
-    command = [sys.executable, "-m", "nbavatar", "warm", "--", *snakemake] if warm else list(snakemake)
     if _HARMLESS & set(snakemake):
-        return wait(subprocess.Popen(command))
+        return wait(subprocess.Popen(list(snakemake)))
+    command = [sys.executable, "-m", "nbavatar", "warm", "--", *snakemake] if warm else list(snakemake)
     token = f"{machine()}-{os.getpid()}-{secrets.token_hex(8)}"
     if slurm:
         command += [PREFIX_OPTION, token]

@@ -235,3 +235,20 @@ def test_a_lock_that_is_younger_than_the_run_is_another_s(start, tmp_path):
     _, error = again.communicate(timeout=PATIENCE_S)
     assert again.returncode == 1 and "found one whose run is not known" in error
     assert len(list((tmp_path / ".snakemake/locks").iterdir())) == 2
+
+
+@pytest.mark.parametrize(("words", "program"), [(["-n"], "snakemake"), ([], "nbavatar")])
+def test_what_starts_no_job_loads_nothing(tmp_path, monkeypatch, words, program):
+    """`nbavatar warm` imports torch, and compiles kernels where none are kept yet."""
+    monkeypatch.chdir(tmp_path)
+    found = []
+    real = subprocess.Popen
+
+    def started(command, **options):
+        found.append(command)
+        return real([sys.executable, "-c", ""], **options)
+
+    monkeypatch.setattr(supervision.subprocess, "Popen", started)
+    assert supervision.run_workflow([sys.executable, "-m", "snakemake", *words], warm=True) == 0
+    command = next(command for command in found if "snakemake" in command)
+    assert command[1:3] == ["-m", program]
