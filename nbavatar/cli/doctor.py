@@ -45,6 +45,7 @@ _OPTIONAL = {
     "gsplat": "another backend for 3D Gaussians on a GPU",
     "pycolmap": "another reader of COLMAP's files",
     "transformers": "masks by SAM 3",
+    "wandb": "curves of a training in Weights & Biases",
 }
 
 

@@ -7,8 +7,9 @@
     --spectral  spectral coordinates (.npz): `<part>.coords` float32 [V, K]
     --out       model.pt, one file; opens with torch.load(weights_only=True)
 
-Beside the model, `<out>.state/` holds the last checkpoint, events.jsonl (losses, PSNR on the training views, speed) and
-previews/ (truth, render, billboard alpha, features). Stopped at any moment, the same command goes on from there. A
+Beside the model, `<out>.state/` holds the last checkpoint, events.jsonl (losses, PSNR on the training views, speed),
+previews/ (truth, render, billboard alpha, features), both again as tensorboard/ and, with {"wandb": "PROJECT"}, as an
+offline run of Weights & Biases in wandb/. Stopped at any moment, the same command goes on from there. A
 state that belongs to other inputs, options or code is moved aside.
 """
 
@@ -24,9 +25,10 @@ from nbavatar.cli.common import add_cfg_argument, stage_config
 from nbavatar.config.core import from_mapping, merge, to_mapping
 from nbavatar.config.training import TrainConfig, own_options
 from nbavatar.devices import device_name, lease_device, peak_memory_mb
-from nbavatar.errors import ConfigError, DataError
+from nbavatar.errors import ConfigError, DataError, require
 from nbavatar.io.arrays import read_arrays
 from nbavatar.io.atomic import atomic_write
+from nbavatar.names import check_name
 from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
@@ -55,6 +57,9 @@ def main(args: argparse.Namespace) -> int:
         config = _with_preset(args.preset, args.presets, config)
     if args.max_minutes is not None:
         config = replace(config, max_minutes=args.max_minutes)
+    if config.wandb:
+        check_name(config.wandb, "option", "wandb", error=ConfigError)
+        require("wandb", "wandb", "the option `wandb`")  # before anything is read or trained
     inputs = {f"frames.{i}": path for i, path in enumerate(args.frames)} | {"meshes": args.meshes}
     if args.spectral:
         inputs["spectral"] = args.spectral
@@ -125,7 +130,9 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
         from nbavatar.metrics.lpips import load_lpips
 
         lpips = load_lpips(net).to(device)
-    with RunFolder(f"{args.out}.state", {name: record[name] for name in ("config", "code", "inputs")}) as folder:
+    key = {name: record[name] for name in ("code", "inputs")}
+    key["config"] = {name: value for name, value in record["config"].items() if name != "wandb"}  # changes no result
+    with RunFolder(f"{args.out}.state", key, wandb=config.wandb) as folder:
         if folder.moved_to is not None:
             print(
                 f"an earlier state belongs to other inputs, options or code; moved to {folder.moved_to}",

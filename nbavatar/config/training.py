@@ -39,6 +39,9 @@ class _Shared:
     rate_factor: float = option(1.0, "Factor on every learning rate.", min=0)
     max_bad_steps: int = option(20, "Non-finite steps in a row before training stops.", min=1)
     previews: int = option(6, "Preview pictures over the whole training.", min=0)
+    wandb: str = option(
+        "", "Project of Weights & Biases: curves are logged to an offline run as well; needs the package wandb."
+    )
     checkpoint_seconds: float = option(60.0, "Time between checkpoints [s].", min=0)
     cache_mb: int = option(2048, "Memory for decoded training frames [MB].", min=0)
     prefetch: int = option(4, "Frames decoded ahead.", min=0)

@@ -3,6 +3,7 @@
     state.pt        model, optimizer, step and clock of the last checkpoint
     events.jsonl    one line per logged step
     tensorboard/    the same numbers and the previews as event files
+    wandb/          the same as an offline run of Weights & Biases, where that is asked for
     key.json        what the state belongs to: configuration, code and inputs
     lock            held while a training writes here (`nbavatar.io.locks`)
     previews/       pictures, named by step
@@ -28,6 +29,7 @@ from nbavatar.io.images import encode_png
 from nbavatar.io.locks import Hold, hold
 from nbavatar.io.records import canonical_json, write_json
 from nbavatar.io.tensors import read_tensors
+from nbavatar.training.offline_run import OfflineRun
 
 __all__ = ["RunFolder"]
 
@@ -38,13 +40,16 @@ class RunFolder:
     Args:
         path: the folder; made when missing.
         key: JSON-ready description of the experiment.
+        wandb: project of Weights & Biases to log to as well, offline; empty for none.
 
     Raises:
         DataError: another process trains in this folder.
     """
 
-    def __init__(self, path: str | os.PathLike[str], key: Mapping[str, Any]) -> None:
+    def __init__(self, path: str | os.PathLike[str], key: Mapping[str, Any], *, wandb: str = "") -> None:
         self.path = Path(path)
+        self._key, self._project = dict(key), wandb
+        self._run: OfflineRun | None = None
         self.moved_to: Path | None = None
         self._curves: EventFile | None = None
         self._first = 0
@@ -70,6 +75,8 @@ class RunFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._run is not None:
+            self._run.close()
         self._lock.release()
 
     def _claim(self) -> Hold:
@@ -111,6 +118,8 @@ class RunFolder:
             stream.write(canonical_json(dict(event)) + "\n")
         numbers = {f"train/{name}": value for name, value in event.items() if name != "step" and value is not None}
         self._event_file().scalars(event["step"], numbers)
+        if run := self._offline_run():
+            run.scalars(event["step"], numbers)
 
     def events(self) -> list[dict[str, Any]]:
         """All whole lines of the events; one that was cut off by a crash, or damaged, is skipped."""
@@ -132,12 +141,21 @@ class RunFolder:
         with atomic_write(self.path / "previews" / f"step_{step:07d}.png") as temporary:
             temporary.write_bytes(png)
         self._event_file().image(step, "preview", png, image.shape[1], image.shape[0])
+        if run := self._offline_run():
+            run.image(step, "preview", image)
 
     def _event_file(self) -> EventFile:
         """The event file of this run, begun when there is something to write."""
         if self._curves is None:
             self._curves = EventFile(self.path / "tensorboard", self._first)
         return self._curves
+
+    def _offline_run(self) -> OfflineRun | None:
+        """The run of Weights & Biases, begun when there is something to write; None where none is asked for."""
+        if self._project and self._run is None:
+            name = "/".join(self.path.parts[-3:-1]) or self.path.name
+            self._run = OfflineRun(str(self.path), self._project, name, self._key)
+        return self._run
 
     def _rewrite_events(self, events: list[dict[str, Any]]) -> None:
         file, text = self.path / "events.jsonl", "".join(canonical_json(event) + "\n" for event in events)
