@@ -48,17 +48,24 @@ class Rendered(NamedTuple):
     alpha: np.ndarray
 
 
-def load_avatar(path: str | os.PathLike[str], device: str = "cpu") -> MeshAvatar:
+def load_avatar(path: str | os.PathLike[str], device: str = "cpu", *, engine: str = "eager") -> MeshAvatar:
     """Reads a trained avatar (model.pt), of whatever method.
 
     Args:
         path: file of `nbavatar train`.
         device: `cpu` or `cuda`.
+        engine: what runs the U-Net on a CPU: `eager` (torch), or up to rounding `openvino`, `onnxruntime`, or `auto`
+            for the fastest that is installed.
 
     Raises:
-        NBAvatarError: missing, damaged, or not an avatar.
+        NBAvatarError: missing, damaged, or not an avatar; an engine that is not there.
     """
-    return _load_avatar(path, device)
+    avatar = _load_avatar(path, device)
+    if device == "cpu":
+        from nbavatar.methods.billboards.engine import chosen_engine
+
+        avatar.use_engine(chosen_engine(engine))
+    return avatar
 
 
 def load_meshes(path: str | os.PathLike[str]) -> MeshSequence:

@@ -21,7 +21,7 @@ from install import CARRIER
 
 ROOT = Path(__file__).resolve().parent.parent
 TORCH = "torch==2.13.0"
-EXTRAS = ("pipeline", "view", "export", "completion", "docs", "test", "lint", "cuda")
+EXTRAS = ("pipeline", "view", "export", "engine", "completion", "docs", "test", "lint", "cuda")
 EVERYWHERE = " ; sys_platform == 'darwin' or sys_platform == 'linux'"  # all that the resolution is made for
 GPU_ONLY = re.compile(r"^(nvidia-|cuda-|numba-cuda|triton)")
 

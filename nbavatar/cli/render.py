@@ -9,6 +9,7 @@ pixels
 --preset    accurate, balanced or fast: a setting that `nbavatar tradeoff` has measured, from --presets or from
             presets.json beside the model; it decides what the protocol says of precision, order and window
 --max-ms    [ms a picture], --min-psnr [dB]: the best measured setting in time, the fastest that is good enough
+--engine    what runs the U-Net on a CPU: torch, an inference engine by name, or auto for the fastest installed
 --out       frame pack (.zip): frames "<camera>/<frame>", layers rgb (on the protocol's background), alpha (opacity of
             the picture) and nb_alpha (opacity of the billboards or Gaussians), uint8
 """
@@ -17,9 +18,9 @@ import argparse
 from typing import Any
 
 from nbavatar.cli.common import progress, read_mapping
-from nbavatar.cli.settings import add_preset_arguments, tuned_avatar
+from nbavatar.cli.settings import add_engine_argument, add_preset_arguments, take_engine, tuned_avatar
 from nbavatar.config.core import from_mapping, to_mapping
-from nbavatar.config.evaluation import ProtocolConfig
+from nbavatar.config.evaluation import EAGER, ProtocolConfig
 from nbavatar.devices import device_name, lease_device
 from nbavatar.errors import DataError
 from nbavatar.provenance import run_record
@@ -42,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="ZIP", help="frame pack to write")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
     add_preset_arguments(parser, budget=True)
+    add_engine_argument(parser, EAGER)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -62,7 +64,7 @@ def _render(args: argparse.Namespace, protocol: ProtocolConfig, device: str) -> 
     from nbavatar.methods.storage import load_avatar
 
     avatar = load_avatar(args.model, device)
-    methods = (avatar.method,)
+    methods, engine = (avatar.method,), take_engine(args, avatar, device)
     sequence, _ = read_sequence(args.meshes)
     packs = [FramePack(path) for path in args.frames]
     chosen = [
@@ -100,7 +102,10 @@ def _render(args: argparse.Namespace, protocol: ProtocolConfig, device: str) -> 
             inputs=inputs,
             device=device_name(device),
             methods=methods,
-            extra={"training": {"config": avatar.record.get("config"), "code": avatar.record.get("code"), **trained}}
+            extra={
+                "engine": engine,
+                "training": {"config": avatar.record.get("config"), "code": avatar.record.get("code"), **trained},
+            }
             | ({"tuned": tuned} if tuned else {}),
         ),
     }

@@ -4,10 +4,11 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
+from nbavatar.config.evaluation import AUTO, EAGER, ENGINES
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.provenance import file_digest
 
-__all__ = ["add_preset_arguments", "timed_device", "tuned_avatar"]
+__all__ = ["add_engine_argument", "add_preset_arguments", "take_engine", "timed_device", "tuned_avatar"]
 
 
 def add_preset_arguments(parser: argparse.ArgumentParser, *, budget: bool) -> None:
@@ -23,6 +24,30 @@ def add_preset_arguments(parser: argparse.ArgumentParser, *, budget: bool) -> No
         parser.add_argument(
             "--min-psnr", type=float, metavar="DB", help="fastest measured setting of at least this PSNR"
         )
+
+
+def add_engine_argument(parser: argparse.ArgumentParser, default: str) -> None:
+    """Declares `--engine`."""
+    own = "the fastest that is installed" if default == AUTO else "torch, by which tables are made"
+    parser.add_argument(
+        "--engine", default=default, choices=ENGINES, help=f"what decodes on a CPU (default: {default}, {own})"
+    )
+
+
+def take_engine(args: argparse.Namespace, avatar: Any, device: str) -> str:
+    """Gives an avatar the engine that `--engine` names; returns its name for records.
+
+    Raises:
+        ConfigError: an engine by name on a GPU.
+        DependencyError: its package is not installed.
+    """
+    from nbavatar.methods.billboards.engine import chosen_engine
+
+    if device != "cpu":
+        if args.engine not in (AUTO, EAGER):
+            raise ConfigError.of("--engine", expected="auto or eager on a GPU", found=args.engine)
+        return EAGER
+    return avatar.use_engine(chosen_engine(args.engine))
 
 
 def timed_device(device: str) -> str:

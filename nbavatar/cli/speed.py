@@ -5,9 +5,10 @@
     --frames   frame packs (.zip): cameras and picture sizes; pixels are not read
     --preset   accurate, balanced or fast: time a setting that `nbavatar tradeoff` has measured (--presets, or
                presets.json beside the model)
+    --engine   an inference engine whose U-Net and whole picture are timed beside torch's (auto: the best installed)
     --out      JSON: median milliseconds per stage (pose, raster with neural textures and with RGB, U-Net per
-               arithmetic, compose, total; a baseline has fewer), frames a second, picture size, number of primitives,
-               size of the model, what its training took, peak memory, device, threads
+               arithmetic and by the engine, compose, total; a baseline has fewer), frames a second, picture size,
+               number of primitives, size of the model, what its training took, peak memory, device, engine, threads
 
 Run it alone on its device. Figures of small test subjects carry their picture size and number of billboards, and
 compare with nothing else.
@@ -17,9 +18,9 @@ import argparse
 import os
 
 from nbavatar.cli.common import add_cfg_argument, stage_config
-from nbavatar.cli.settings import add_preset_arguments, tuned_avatar
+from nbavatar.cli.settings import add_engine_argument, add_preset_arguments, take_engine, tuned_avatar
 from nbavatar.config.core import to_mapping
-from nbavatar.config.evaluation import SpeedConfig
+from nbavatar.config.evaluation import AUTO, SpeedConfig
 from nbavatar.devices import device_name, lease_device
 from nbavatar.io.records import write_json
 from nbavatar.provenance import run_record
@@ -35,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="JSON", help="record to write")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
     add_preset_arguments(parser, budget=False)
+    add_engine_argument(parser, AUTO)
     add_cfg_argument(parser, SpeedConfig)
 
 
@@ -50,14 +52,14 @@ def main(args: argparse.Namespace) -> int:
         from nbavatar.methods.storage import load_avatar
 
         avatar = load_avatar(args.model, device)
-        methods = (avatar.method,)
+        methods, engine = (avatar.method,), take_engine(args, avatar, device)
         sequence, _ = read_sequence(args.meshes)
         packs = [FramePack(path) for path in args.frames]
         wanted = max(1, config.frames // len(packs))
         chosen = [select_frames(pack.frames, {}, "all", wanted) for pack in packs]
         views = views_of(packs, sequence.frames, chosen)[: config.frames]
         avatar, tuned = tuned_avatar(args, avatar, device, (views[0].width, views[0].height))
-        result = measure_speed(avatar, sequence, views, config, device=device)
+        result = measure_speed(avatar, sequence, views, config, device=device, engine=engine)
         width, height = result["size"]
         result["model_mb"] = round(os.path.getsize(args.model) / 1e6, 3)
         trained = avatar.record.get("summary", {})

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
+from nbavatar.cli.settings import add_engine_argument, take_engine
 from nbavatar.config.core import to_mapping
-from nbavatar.config.evaluation import VideoConfig
+from nbavatar.config.evaluation import AUTO, EAGER, VideoConfig
 from nbavatar.devices import device_name, lease_device
 from nbavatar.errors import ConfigError, DataError, did_you_mean
 from nbavatar.io.records import write_json
@@ -42,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frame", metavar="ID", help="turntable: which frame; the middle one by default")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
     parser.add_argument("--out", required=True, metavar="MP4", help="video to write")
+    add_engine_argument(parser, AUTO)
     add_cfg_argument(parser, VideoConfig)
 
 
@@ -55,11 +57,11 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError.of("--out", expected="a name that ends in .mp4", found=args.out)
     cfg = stage_config(args, VideoConfig)
     with lease_device("cpu" if args.render else args.device) as device:
-        count, pictures = _stored(args, cfg) if args.render else _rendered(args, cfg, device)
+        engine, count, pictures = (EAGER, *_stored(args, cfg)) if args.render else _rendered(args, cfg, device)
         with VideoWriter(args.out, cfg.fps, cfg.codec) as writer:
             for picture in progress(pictures, f"video {args.kind}", count):
                 writer.add(picture)
-        config = to_mapping(cfg) | {"kind": args.kind, "frame": args.frame}
+        config = to_mapping(cfg) | {"kind": args.kind, "frame": args.frame, "engine": engine}
         record = run_record("video", config=config, inputs=given, device=device_name(device))
     write_json(f"{args.out}.json", {"kind": "video", "frames": count, "record": record})
     print(f"{args.out}: {count} frames, {count / cfg.fps:.1f} s, {Path(args.out).stat().st_size / 1e6:.1f} MB")
@@ -80,7 +82,7 @@ def _stored(args: argparse.Namespace, cfg: VideoConfig) -> tuple[int, Iterator["
     return len(names), pictures()
 
 
-def _rendered(args: argparse.Namespace, cfg: VideoConfig, device: str) -> tuple[int, Iterator["np.ndarray"]]:
+def _rendered(args: argparse.Namespace, cfg: VideoConfig, device: str) -> tuple[str, int, Iterator["np.ndarray"]]:
     from nbavatar.config.evaluation import ProtocolConfig
     from nbavatar.data.sequences import read_sequence
     from nbavatar.evaluation.orbit import driven_views, turntable_views
@@ -89,6 +91,7 @@ def _rendered(args: argparse.Namespace, cfg: VideoConfig, device: str) -> tuple[
     from nbavatar.methods.storage import load_avatar
 
     avatar = load_avatar(args.model, device)
+    engine = take_engine(args, avatar, device)
     sequence, _ = read_sequence(args.meshes)
     check_parts(avatar, sequence)
     with FramePack(args.camera) as pack:
@@ -111,4 +114,4 @@ def _rendered(args: argparse.Namespace, cfg: VideoConfig, device: str) -> tuple[
         views = driven_views(sequence, rows, manifest, K, camera)
         views = [view._replace(K=view.K.new_tensor(own[view.frame])) if view.frame in own else view for view in views]
     pictures = render_views(avatar, sequence, views, ProtocolConfig(), device=device)
-    return len(views), (picture.rgb for picture in pictures)
+    return engine, len(views), (picture.rgb for picture in pictures)

@@ -19,6 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nbavatar.cli.settings import add_engine_argument, take_engine
+from nbavatar.config.evaluation import AUTO
 from nbavatar.devices import lease_device
 from nbavatar.errors import DataError, did_you_mean
 
@@ -40,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8080, help="the next free one is taken if it is in use")
     parser.add_argument("--side", type=int, default=512, help="longer side of a picture at rest [px]")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
+    add_engine_argument(parser, AUTO)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -76,7 +79,7 @@ def open_scene(args: argparse.Namespace, device: str) -> "Scene":
     from nbavatar.viewer.scene import Scene
 
     models, known = _models(args), {}
-    entries = [_entry(model, name, args.meshes, known, device) for model, name in models.items()]
+    entries = [_entry(model, name, args, known, device) for model, name in models.items()]
     first = next(iter(models))
     packs = [FramePack(path) for path in args.cameras or _cameras_of(first, entries[0].avatar.record)]
     return Scene(entries, {str(pack.manifest["camera"]): pack for pack in packs}, device)
@@ -104,7 +107,7 @@ def _models(args: argparse.Namespace) -> dict[Path, str]:
     return {path: name if unique else str(path) for path, name in zip(paths, names, strict=True)}
 
 
-def _entry(model: Path, name: str, given: str | None, known: dict[str, Any], device: str) -> "Entry":
+def _entry(model: Path, name: str, args: argparse.Namespace, known: dict[str, Any], device: str) -> "Entry":
     """One avatar, not loaded yet; what is loaded of mesh sequences is kept in `known`."""
     from nbavatar.data.sequences import read_sequence
     from nbavatar.methods.storage import load_avatar
@@ -112,7 +115,8 @@ def _entry(model: Path, name: str, given: str | None, known: dict[str, Any], dev
 
     def load() -> Any:
         avatar = load_avatar(model, device)
-        meshes = given or _meshes_of(model, avatar.record)
+        take_engine(args, avatar, device)
+        meshes = args.meshes or _meshes_of(model, avatar.record)
         if meshes is None:
             raise DataError.of("--meshes", expected=f"the mesh sequence of {model}", found="none given, none beside it")
         if str(meshes) not in known:

@@ -13,6 +13,10 @@ from nbavatar.config.core import option, to_mapping
 __all__ = ["PROTOCOLS", "EvaluateConfig", "ProtocolConfig", "ReportConfig", "SpeedConfig", "TableConfig", "VideoConfig"]
 __all__ += ["protocol_hash"]
 
+AUTO, EAGER = "auto", "eager"
+ENGINES = (AUTO, EAGER, "openvino", "onnxruntime")
+"""What may decode pictures (`nbavatar.methods.billboards.engine`): the best that is installed, torch, or others."""
+
 
 @dataclass(frozen=True)
 class SpeedConfig:

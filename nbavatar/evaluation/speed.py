@@ -9,6 +9,8 @@ because a busy machine only ever makes a sample longer. The stages are those of 
     compose     colour over background
     total       all of it, one picture from vertices to RGB, per arithmetic
 
+Beside each arithmetic of torch's stand `renderer_engine` and `total_engine` where the avatar has an engine.
+
 A baseline has its own stages (`MeshAvatar.stages`); `total` is common to all.
 """
 
@@ -20,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nbavatar.config.evaluation import SpeedConfig
+from nbavatar.config.evaluation import EAGER, SpeedConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
 from nbavatar.devices import peak_memory_mb
@@ -31,8 +33,9 @@ __all__ = ["measure_speed"]
 
 
 def measure_speed(
-    avatar: MeshAvatar, sequence: MeshSequence, views: Sequence[View], config: SpeedConfig, *, device: str = "cpu"
-) -> dict[str, Any]:
+    avatar: MeshAvatar, sequence: MeshSequence, views: Sequence[View], config: SpeedConfig, *, device: str = "cpu",
+    engine: str = EAGER,
+) -> dict[str, Any]:  # fmt: skip
     """Time an avatar on real frames.
 
     Args:
@@ -41,11 +44,12 @@ def measure_speed(
         views: pictures to time (their sizes are used as they are).
         config: number of passes, arithmetics.
         device: where the avatar computes.
+        engine: what `MeshAvatar.use_engine` returned; its stages stand beside torch's.
 
     Returns:
-        JSON-ready: `method`, `ms` per stage (median), `fps` of the totals, `size`, `primitives`, what the kind of
-        avatar adds (`MeshAvatar.facts`), `window` (mean share of the picture that is computed), `peak_memory_mb`,
-        `threads`.
+        JSON-ready: `method`, `engine`, `ms` per stage (median), `fps` of the totals, `size`, `primitives`, what
+        the kind of avatar adds (`MeshAvatar.facts`), `window` (mean share of the picture that is computed),
+        `peak_memory_mb`, `threads`.
     """
     check_parts(avatar, sequence)
     avatar.eval()
@@ -57,6 +61,7 @@ def measure_speed(
     view = views[0]
     return {
         "method": avatar.method,
+        "engine": engine,
         "ms": {name: round(value, 4) for name, value in times.items()},
         "fps": {name: round(1000.0 / value, 2) for name, value in times.items() if name.startswith("total")},
         "size": [view.width, view.height],

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from nbavatar.config.evaluation import EAGER
 from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
@@ -167,6 +168,17 @@ class MeshAvatar(nn.Module, ABC):
         Returns:
             image (3, H, W), alpha (H, W) and the primitives' own alpha (H, W).
         """
+
+    def use_engine(self, kind: str) -> str:
+        """Let an inference engine do what it can of a picture in torch's place, up to rounding.
+
+        Args:
+            kind: `eager` (none), or one of `nbavatar.config.evaluation.ENGINES` that is installed.
+
+        Returns:
+            Its name with its version for records; `eager` where the kind of avatar has nothing to hand over.
+        """
+        return EAGER
 
     def panels(
         self,

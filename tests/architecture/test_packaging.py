@@ -97,7 +97,7 @@ def _declared(*extras: str) -> list[Requirement]:
 
 def test_the_lock_holds_every_declared_package_in_a_version_that_fits():
     base, gpu = _pins("requirements.lock"), _pins("requirements-cuda.lock")
-    for requirement in _declared("pipeline", "view", "export", "completion", "docs", "test", "lint"):
+    for requirement in _declared("pipeline", "view", "export", "engine", "completion", "docs", "test", "lint"):
         assert requirement.specifier.contains(base[canonicalize_name(requirement.name)]), requirement
     for requirement in _declared("cuda")[len(PROJECT["dependencies"]) :]:
         assert requirement.specifier.contains(gpu[canonicalize_name(requirement.name)]), requirement

@@ -15,14 +15,16 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from nbavatar.config.evaluation import EAGER
 from nbavatar.math.rotations import matrix_to_quaternion
 from nbavatar.mesh.frames import FaceFrames, face_frames
 from nbavatar.methods.base import MeshAvatar, Stages, compose
 from nbavatar.methods.billboards.billboards import Billboards, Posed
 from nbavatar.methods.billboards.compression.sized import SizedBillboards
+from nbavatar.methods.billboards.engine import DecoderEngine
 from nbavatar.methods.billboards.refine import Refinement
 from nbavatar.methods.billboards.region import Region, full_region, paste, region_of, shift_camera
-from nbavatar.methods.billboards.unet import UNet, macs
+from nbavatar.methods.billboards.unet import FORMS, UNet, macs
 from nbavatar.rendering.billboards.functional import render_billboards
 
 __all__ = ["Anchor", "Architecture", "Avatar", "Window"]
@@ -45,6 +47,14 @@ class Architecture:
     roi: bool
     roi_margin: float
     order: str
+    unet_form: str = "paper"  # what files hold that were written before there was another
+
+    def renderer(self) -> UNet:
+        """The U-Net of these numbers, its weights still random."""
+        return UNet(
+            self.channels + 1, width=self.unet_width, depth=self.unet_depth, max_width=self.unet_max_width,
+            convs=self.unet_convs, form=self.unet_form,
+        )  # fmt: skip
 
 
 class Anchor(NamedTuple):
@@ -88,6 +98,7 @@ class Avatar(MeshAvatar):
         billboards: one per face (`SizedBillboards` where textures have sizes of their own).
         unet: renderer R, or None without deferred rendering.
         refinement: compensation of fitting errors on training frames, or None.
+        engine: what decodes in torch's place where it can, or None (`use_engine`).
     """
 
     method: ClassVar[str] = "billboards"
@@ -105,15 +116,10 @@ class Avatar(MeshAvatar):
         super().__init__(faces, vertex_counts, record)
         self.architecture = architecture
         self.billboards = billboards
-        a = architecture
-        self.unet = (
-            UNet(
-                a.channels + 1, width=a.unet_width, depth=a.unet_depth, max_width=a.unet_max_width, convs=a.unet_convs
-            ).to(memory_format=torch.channels_last)
-            if a.deferred
-            else None
-        )
+        unet = architecture.renderer() if architecture.deferred else None
+        self.unet = None if unet is None else unet.to(memory_format=torch.channels_last)
         self.refinement = refinement
+        self.engine: DecoderEngine | None = None
 
     @property
     def primitives(self) -> int:
@@ -174,6 +180,7 @@ class Avatar(MeshAvatar):
         precision: str = "fp32",
         roi: bool | None = None,
         order: str | None = None,
+        engine: bool = True,
     ) -> Window:
         """Rasterize and decode one view.
 
@@ -182,6 +189,7 @@ class Avatar(MeshAvatar):
             viewmat: world to camera (4, 4); K: intrinsics (3, 3) [px]; width, height: image size [px].
             precision: fp32, bf16 or fp16 for the U-Net.
             roi, order: override the avatar's own settings.
+            engine: whether the avatar's engine may decode.
         """
         a = self.architecture
         features, alpha = self.textures()
@@ -202,7 +210,7 @@ class Avatar(MeshAvatar):
             region.height,
             order=order or a.order,
         )
-        colour, opacity = self.decode(premultiplied, nb_alpha, precision)
+        colour, opacity = self.decode(premultiplied, nb_alpha, precision, engine=engine)
         return Window(colour, opacity, nb_alpha, premultiplied, region)
 
     def textures(self) -> tuple[Tensor, Tensor]:
@@ -210,17 +218,30 @@ class Avatar(MeshAvatar):
         features = self.billboards.features
         return (features if self.unet is not None else torch.sigmoid(features)), self.billboards.alpha()
 
-    def decode(self, features: Tensor, nb_alpha: Tensor, precision: str = "fp32") -> tuple[Tensor, Tensor]:
+    def use_engine(self, kind: str) -> str:
+        """See `MeshAvatar.use_engine`."""
+        self.engine = None if kind == EAGER or self.unet is None else DecoderEngine(kind)
+        return EAGER if self.engine is None else self.engine.name
+
+    def decode(
+        self, features: Tensor, nb_alpha: Tensor, precision: str = "fp32", *, engine: bool = True
+    ) -> tuple[Tensor, Tensor]:
         """Colour I_R (3, h, w) and opacity I_alpha (h, w) from rasterized features (C, h, w) and alpha (h, w)."""
         if self.unet is None:
             return features / nb_alpha.clamp_min(1e-6), nb_alpha
         stacked = torch.cat((features, nb_alpha[None]))[None].contiguous(memory_format=torch.channels_last)
-        if precision == "fp32":
-            colour, opacity = self.unet(stacked)
-        else:
-            with torch.autocast(stacked.device.type, dtype=_DTYPES[precision]):
-                colour, opacity = self.unet(stacked)
+        colour, opacity = self.run_unet(stacked, precision, engine=engine)
         return colour[0], opacity[0, 0]
+
+    def run_unet(self, stacked: Tensor, precision: str = "fp32", *, engine: bool = True) -> tuple[Tensor, Tensor]:
+        """`UNet.forward` of features and alpha (1, C+1, h, w), by the engine where it may and can."""
+        assert self.unet is not None
+        if precision == "fp32":
+            if engine and self.engine is not None and self.engine.takes(stacked, self.unet):
+                return self.engine(self.unet, stacked)
+            return self.unet(stacked)
+        with torch.autocast(stacked.device.type, dtype=_DTYPES[precision]):
+            return self.unet(stacked)
 
     def render(
         self,
@@ -294,11 +315,16 @@ class Avatar(MeshAvatar):
             "raster_rgb": raster(rgb),
             "compose": lambda: compose(window.colour, window.alpha, background),
         }
-        for precision in precisions if self.unet is not None else ["fp32"]:
+        kinds = {p: (p, False) for p in (precisions if self.unet is not None else ["fp32"])}
+        if self.engine is not None:
+            kinds["engine"] = "fp32", True
+        for name, (precision, engine) in kinds.items():
             if self.unet is not None:
-                calls[f"renderer_{precision}"] = lambda p=precision: self.decode(window.features, window.nb_alpha, p)
-            calls[f"total_{precision}"] = lambda p=precision: self.render(
-                verts, viewmat, K, width, height, background, precision=p
+                calls[f"renderer_{name}"] = lambda p=precision, e=engine: self.decode(
+                    window.features, window.nb_alpha, p, engine=e
+                )
+            calls[f"total_{name}"] = lambda p=precision, e=engine: self.render(
+                verts, viewmat, K, width, height, background, precision=p, engine=e
             )[0]
         return Stages(calls, region.width * region.height / (width * height))
 
@@ -350,10 +376,11 @@ def _check_stored(a: Architecture, refinement: Mapping[str, Any] | None, state: 
     """
     if not (0 < a.texels <= _MOST_TEXELS and 0 < a.unet_depth <= _DEEPEST and 0 < a.unet_convs <= _DEEPEST):
         raise ValueError(f"{a.texels} texels, {a.unet_depth} stages of {a.unet_convs} convolutions")
+    if a.unet_form not in FORMS:
+        raise ValueError(f"a U-Net of the form {a.unet_form!r}")
     if a.deferred:
         with torch.device("meta"):  # shapes without memory
-            unet = UNet(a.channels + 1, width=a.unet_width, depth=a.unet_depth, max_width=a.unet_max_width,
-                        convs=a.unet_convs)  # fmt: skip
+            unet = a.renderer()
         for name, value in unet.state_dict().items():
             if state[f"unet.{name}"].shape != value.shape:
                 raise ValueError(f"unet.{name} of {list(state[f'unet.{name}'].shape)} instead of {list(value.shape)}")

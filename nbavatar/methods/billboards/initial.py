@@ -70,6 +70,7 @@ def initial_avatar(
             unet_depth=options.unet.depth,
             unet_max_width=options.unet.max_width,
             unet_convs=options.unet.convs,
+            unet_form=options.unet.form,
             roi=options.roi,
             roi_margin=options.roi_margin,
             order=options.order,

@@ -15,6 +15,10 @@ class UNetConfig:
     depth: int = option(5, "Number of stride-2 stages.", min=1, max=8)
     max_width: int = option(512, "Most channels of any level.", min=1)
     convs: int = option(2, "Convolutions a level.", min=1, max=4)
+    form: str = option(
+        "paper", "The paper's, or lean: on the way up 1x1 before the upsampling, and skips added.",
+        choices=("paper", "lean"),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Supplement, "Renderer architecture": stride-2 convolutions with Instance Normalization and LeakyReLU on the way
 down, bilinear upsampling followed by 3x3 convolutions on the way up (no transposed convolutions, so no
-checkerboard), skip connections at every level, and two heads with sigmoids.
+checkerboard), skip connections at every level, and two heads with sigmoids. A leaner form is an option.
 
     input   float [B, C+1, H, W]   premultiplied features and the alpha of the billboards; H, W multiples of 2^depth
     result  colour float [B, 3, H, W] and opacity float [B, 1, H, W], both in [0, 1]
@@ -16,7 +16,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["UNet", "macs", "normalised_picture"]
+__all__ = ["FORMS", "UNet", "macs", "normalised_picture"]
+
+FORMS = ("paper", "lean")
+"""Forms of the way up, see `UNet`."""
 
 _SLOPE = 0.2
 
@@ -60,6 +63,21 @@ def _stage(channels_in: int, channels_out: int, *, stride: int = 1, norm: bool =
     return nn.Sequential(*layers)
 
 
+class _Lift(nn.Conv2d):
+    """Convolution 1x1, as a product of matrices where the channels lie together: on one thread torch has no fast kernel
+    for it.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__(channels_in, channels_out, 1)
+
+    def forward(self, input: Tensor) -> Tensor:
+        if not input.is_contiguous(memory_format=torch.channels_last):
+            return super().forward(input)
+        pixels = functional.linear(input.permute(0, 2, 3, 1), self.weight.flatten(1), self.bias)
+        return pixels.permute(0, 3, 1, 2)
+
+
 class UNet(nn.Module):
     """Renderer R of the paper.
 
@@ -70,18 +88,37 @@ class UNet(nn.Module):
         max_width: cap of the channels of the deep levels.
         convs: convolutions a level on the way down; the way up has one after the upsampling and ``convs`` after the
             skip.
+        form: `paper`, or `lean`: on the way up a 1x1 convolution before the upsampling takes the place of the 3x3 one
+            after it, skips are added instead of put beside (as in LinkNet, Chaurasia and Culurciello 2017), and
+            colour and opacity are one convolution. Most of the paper's form is spent at full resolution; of that
+            two fifths are left.
     """
 
-    def __init__(self, channels: int, *, width: int = 32, depth: int = 5, max_width: int = 512, convs: int = 2) -> None:
+    def __init__(
+        self,
+        channels: int,
+        *,
+        width: int = 32,
+        depth: int = 5,
+        max_width: int = 512,
+        convs: int = 2,
+        form: str = "paper",
+    ) -> None:
         super().__init__()
+        self.lean = form == "lean"
         widths = [min(width * 2**level, max_width) for level in range(depth + 1)]
         self.multiple = 2**depth
         self.stem = _stage(channels, widths[0], norm=False)
         self.down = nn.ModuleList(_stage(widths[i], widths[i + 1], stride=2, convs=convs) for i in range(depth))
-        self.lift = nn.ModuleList(_stage(widths[i + 1], widths[i]) for i in range(depth))
-        self.merge = nn.ModuleList(_stage(2 * widths[i], widths[i], norm=i > 0, convs=convs) for i in range(depth))
-        self.colour = nn.Conv2d(widths[0], 3, 3, padding=1)
-        self.opacity = nn.Conv2d(widths[0], 1, 3, padding=1)
+        lift = _Lift if self.lean else _stage
+        self.lift = nn.ModuleList(lift(widths[i + 1], widths[i]) for i in range(depth))
+        joined = 1 if self.lean else 2
+        self.merge = nn.ModuleList(_stage(joined * widths[i], widths[i], norm=i > 0, convs=convs) for i in range(depth))
+        if self.lean:
+            self.head = nn.Conv2d(widths[0], 4, 3, padding=1)
+        else:
+            self.colour = nn.Conv2d(widths[0], 3, 3, padding=1)
+            self.opacity = nn.Conv2d(widths[0], 1, 3, padding=1)
         self.upsample = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,8 +148,14 @@ class UNet(nn.Module):
             skips.append(value)
             value = stage(value)
         for level in reversed(range(len(skips))):
-            value = self.lift[level](self.upsample(value))
-            value = self.merge[level](torch.cat((value, skips[level]), dim=1))
+            if self.lean:
+                value = self.merge[level](self.upsample(self.lift[level](value)) + skips[level])
+            else:
+                value = self.lift[level](self.upsample(value))
+                value = self.merge[level](torch.cat((value, skips[level]), dim=1))
+        if self.lean:
+            head = self.head(value)
+            return head[:, :3], head[:, 3:]
         return self.colour(value), self.opacity(value)
 
 

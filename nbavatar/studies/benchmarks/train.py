@@ -65,7 +65,7 @@ def _measure(args: argparse.Namespace, device: str) -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "size": args.size,
         "billboards": method.avatar.primitives,
-        "unet_width": config.billboards.unet.width,
+        "unet_width": config.own.unet.width,
         "perceptual_crop": plan.crop,
     }
     scene.step()
@@ -82,7 +82,7 @@ def _options(args: argparse.Namespace) -> TrainConfig:
     """Those of a run's file where one is named, else the paper's with the sizes that are asked for."""
     if args.config is not None:
         config = training_options(args.config)
-        own = dataclasses.replace(config.billboards, roi=False, precision=args.precision)
+        own = dataclasses.replace(config.own, roi=False, precision=args.precision)
         return dataclasses.replace(config, billboards=own)
     return TrainConfig(
         lpips_crop=args.lpips_crop,

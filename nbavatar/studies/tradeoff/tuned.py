@@ -302,9 +302,11 @@ class TunedAvatar:
         self.work.decoded_pixels += stacked.shape[-1] * stacked.shape[-2]
         layout = torch.channels_last if s.channels_last else torch.contiguous_format
         stacked = stacked.contiguous(memory_format=layout)
-        low = torch.autocast(stacked.device.type, dtype=_DTYPES[s.precision], enabled=s.precision != "fp32")
-        with low:
-            colour, opacity = self._unet(stacked)
+        if self._unet is self.avatar.unet:
+            colour, opacity = self.avatar.run_unet(stacked, s.precision)
+        else:
+            with torch.autocast(stacked.device.type, dtype=_DTYPES[s.precision], enabled=s.precision != "fp32"):
+                colour, opacity = self._unet(stacked)
         both = torch.cat((colour, opacity), dim=1)
         if shrink > 1:
             both = functional.interpolate(both, scale_factor=shrink, mode="bilinear", align_corners=False)

@@ -24,12 +24,16 @@ def test_speed_times_every_stage_of_the_papers_table(tmp_path, deferred: bool) -
     train += ["--cfg", json.dumps(train_options(cfg))]
     assert main(train) == 0
     timing = json.dumps({"frames": 2, "repeats": 3, "warmup": 1})
-    assert main(["speed", "--model", model, *frames, *common, "--out", out, "--cfg", timing]) == 0
+    assert (
+        main(["speed", "--model", model, *frames, *common, "--out", out, "--cfg", timing, "--engine", "onnxruntime"])
+        == 0
+    )
     record = read_json(out)
     speed = record["speed"]
     expected = {"pose", "raster", "raster_rgb", "compose", "total_fp32"}
     if deferred:
-        expected |= {"renderer_fp32", "renderer_bf16", "total_bf16"}
+        expected |= {"renderer_fp32", "renderer_bf16", "total_bf16", "renderer_engine", "total_engine"}
+    assert speed["engine"].startswith("onnxruntime " if deferred else "eager")
     assert set(speed["ms"]) == expected and all(value > 0 for value in speed["ms"].values())
     for name, fps in speed["fps"].items():
         assert fps == pytest.approx(1000 / speed["ms"][name], rel=0.01)

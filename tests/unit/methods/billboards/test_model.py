@@ -100,6 +100,8 @@ def test_load_refuses_what_is_not_an_avatar(tmp_path) -> None:
         {"unet_depth": 10**9},
         {"texels": 10**6},
         {"channels": 10**7},
+        {"unet_form": "lean"},
+        {"unet_form": "other"},
     ],
 )
 def test_sizes_that_the_tensors_do_not_have_are_refused_before_anything_is_made(tmp_path, sizes) -> None:
@@ -210,3 +212,13 @@ def test_importing_the_model_loads_nothing_heavy() -> None:
     code += "; heavy = {'cv2', 'igl', 'scipy', 'trimesh', 'OpenEXR', 'matplotlib', 'pandas'} & set(sys.modules)"
     code += "; assert not heavy, heavy"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_files_from_before_there_were_forms_hold_the_papers(tmp_path) -> None:
+    avatar = make_avatar()
+    save_avatar(tmp_path / "model.pt", avatar)
+    content = torch.load(tmp_path / "model.pt", weights_only=True)
+    assert content["architecture"].pop("unet_form") == "paper"
+    torch.save(content, tmp_path / "model.pt")
+    for a, b in zip(render(avatar), render(load_avatar(tmp_path / "model.pt")), strict=True):
+        assert torch.equal(a, b)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from torch import nn
+from torch.nn import functional
 
 from nbavatar.methods.billboards.unet import UNet, macs
 
@@ -91,3 +92,28 @@ def test_macs_of_one_level_equal_hand_count() -> None:
     expected = 9 * (full * (3 * 2 + 4 * 2 + 4 * 2 + 2 * 3 + 2 * 1) + half * 2 * 4)
     assert macs(network, 8, 8) == expected
     assert macs(network, 16, 8) == 2 * expected
+
+
+def test_the_lean_form_is_what_it_says() -> None:
+    """Against plain operations, one after the other, in both memory layouts."""
+    net = UNet(4, width=4, depth=2, max_width=8, convs=1, form="lean").double().eval()
+    features = torch.randn(1, 4, 12, 8, dtype=torch.float64)
+
+    def level(stage, value):
+        return functional.leaky_relu(stage[1](stage[0](value)), 0.2)
+
+    stem = functional.leaky_relu(net.stem[0](features), 0.2)
+    first = level(net.down[0], stem)
+    value = level(net.down[1], first)
+    for lift, skip in zip(reversed(net.lift), (first, stem), strict=True):
+        thin = torch.einsum("oi,bihw->bohw", lift.weight[:, :, 0, 0], value) + lift.bias[:, None, None]
+        value = functional.interpolate(thin, scale_factor=2, mode="bilinear", align_corners=False) + skip
+        merge = net.merge[1 if skip is first else 0]
+        value = level(merge, value) if skip is first else functional.leaky_relu(merge[0](value), 0.2)
+    expected = torch.sigmoid(net.head(value))
+    for layout in (torch.contiguous_format, torch.channels_last):
+        colour, opacity = net.to(memory_format=layout)(features.contiguous(memory_format=layout))
+        torch.testing.assert_close(torch.cat((colour, opacity), 1), expected, rtol=1e-12, atol=1e-12)
+    full = UNet(7, width=16, convs=1, max_width=96)
+    lean = UNet(7, width=16, convs=1, max_width=96, form="lean")
+    assert macs(lean, 256, 256) < 0.45 * macs(full, 256, 256)
