@@ -7,6 +7,7 @@
     nbavatar bench fit       multi-view refit, frames a second and millimetres
     nbavatar bench train     one training step, part by part
     nbavatar bench decoder   the U-Net by torch and by inference engines, in turns
+    nbavatar bench scaling   time and memory against size: exponents and plots
     nbavatar bench waiting   training steps whose threads wait for each other in two ways, in turns
 
 Times depend on the machine and on what else it does: compare figures of one run only.
@@ -21,8 +22,8 @@ from nbavatar.cli.run import pipeline_folder
 
 __all__ = ["add_arguments", "main"]
 
-_OF_CAPTURES = ("decoder", "waiting")  # measure a capture's training unless another run is named
-_KERNELS = ("raster", "splat", "deform", "spectral", "fit", "train", "decoder", "waiting")
+_OF_CAPTURES = ("decoder", "scaling", "waiting")  # measure a capture's training unless another run is named
+_KERNELS = ("raster", "splat", "deform", "spectral", "fit", "train", "decoder", "scaling", "waiting")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

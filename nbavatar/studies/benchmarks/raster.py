@@ -17,7 +17,6 @@ by its event clock; `samples` are still counted by the CPU's kernels.
 """
 
 import argparse
-import contextlib
 import statistics
 import time
 from collections.abc import Callable
@@ -32,6 +31,7 @@ from nbavatar.rendering.billboards import render_billboards
 from nbavatar.rendering.billboards.projection import project_billboards, texture_support
 from nbavatar.rendering.billboards.reference import BlendSettings, critical_pixels
 from nbavatar.rendering.ordering import canonical_rank, parse_order
+from nbavatar.studies.benchmarks.memory import forget_peak, memory_mb
 from nbavatar.studies.benchmarks.raster_scene import RasterScene, make_scene
 
 __all__ = ["add_arguments", "run"]
@@ -129,29 +129,12 @@ def _median_ms(action: Callable[[], Any], repeats: int, device: str) -> tuple[fl
     return statistics.median(wall), statistics.median(processor)
 
 
-def _memory_mb(entry: str) -> float:
-    """What the system says of this process's memory: VmRSS now, VmHWM at its largest [MiB]."""
-    try:
-        with open("/proc/self/status") as handle:
-            return next(int(line.split()[1]) / 1024 for line in handle if line.startswith(entry))
-    except (OSError, StopIteration):
-        import resource
-
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-
-
-def _forget_peak() -> None:
-    """Has the largest memory counted anew from here, where the system can."""
-    with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as handle:
-        handle.write("5")
-
-
 def measure(scene: RasterScene, order: str, repeats: int) -> dict[str, Any]:
     """Times of the forward and the backward pass, and what they blend and take."""
     device = scene.means.device.type
     workspace.release()  # what earlier scenes have left would hide this one's memory
-    _forget_peak()
-    before = _memory_mb("VmRSS")
+    forget_peak()
+    before = memory_mb("VmRSS")
     with torch.no_grad():
         forward, forward_cpu = _median_ms(lambda: _render(scene, order), repeats, device)
     leaves = [tensor.detach().clone().requires_grad_() for tensor in scene.billboards]
@@ -162,7 +145,7 @@ def measure(scene: RasterScene, order: str, repeats: int) -> dict[str, Any]:
     backward, backward_cpu = _median_ms(
         lambda: torch.autograd.grad(outputs, leaves, grads, retain_graph=True), max(3, repeats // 2), device
     )
-    peak = torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else _memory_mb("VmHWM") - before
+    peak = torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else memory_mb("VmHWM") - before
     device_times = _blend_times(scene, order, repeats) if device == "cuda" else {}
     samples = _samples(scene, order)
     return {
