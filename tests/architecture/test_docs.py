@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(
@@ -18,3 +19,20 @@ def test_links_lead_to_files(page):
     assert [name for name in named if not (page.parent / name).exists()] == []
     mentioned = re.findall(r"(?<![\w/.])(docs/[\w/.-]+\.md)", text)
     assert [name for name in mentioned if not (ROOT / name).exists()] == []
+
+
+def test_pictures_are_small_and_all_are_shown():
+    """Of kinds that GitHub shows; one of them moves. A reader on a phone loads them all."""
+    pictures = sorted((ROOT / "docs" / "pictures").iterdir())
+    assert {path.suffix for path in pictures} <= {".png", ".webp", ".gif"}
+    assert sum(path.stat().st_size for path in pictures) < 1.5e6
+    shown = {
+        Path(name).name for page in PAGES for name in re.findall(r"!\[[^]]+\]\(([^)]+)\)", page.read_text("utf-8"))
+    }
+    assert {path.name for path in pictures} == shown
+    moving = []
+    for path in pictures:
+        with Image.open(path) as image:
+            image.load()
+            moving += [path.name] if getattr(image, "n_frames", 1) > 1 else []
+    assert moving == ["avatar-moves.webp"]
