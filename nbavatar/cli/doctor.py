@@ -5,7 +5,9 @@ libraries too), compiles and runs a small kernel, looks for the LPIPS weights an
 and prints one line per finding. Nothing is changed. Exit code 0 if the synthetic pipeline (`nbavatar run smoke`) can
 run, 2 if a package for it is missing or no kernel can be compiled; body models and dataset are needed for the paper
 only and do not count. With --brief one line: that all is well, or the first thing that is missing and what to do.
-With --json the same as one JSON object:
+With --gpu one line about the GPU instead: whether its kernels compute what the float64 reference computes, forward
+and backward, and how long a frame takes; exit code 2 if they do not. It is found once for a card and a version, and
+`train` finds it before the first training on a GPU. With --json all the other findings as one JSON object:
 
   machine      processors, memory_gb, disk_free_gb, gpus [names]
   kernel       null, or why no kernel can be compiled and run
@@ -30,6 +32,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from nbavatar.devices import lease_device
 from nbavatar.errors import NBAvatarError
 from nbavatar.gpus import list_gpus
 from nbavatar.packages import distribution_of, extra_of, install_line, installed, remedy
@@ -54,6 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     form.add_argument("--brief", action="store_true", help="print one line: all is well, or what is missing first")
+    form.add_argument("--gpu", action="store_true", help="compare this machine's GPU with the reference and time it")
+    parser.add_argument("--again", action="store_true", help="with --gpu: do it anew, where it was done before")
     parser.add_argument(
         "--root",
         default="resources/DecafDataset",
@@ -63,13 +68,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Prints the findings; 2 if the synthetic pipeline cannot run."""
+    """Prints the findings; 2 if the synthetic pipeline cannot run, or the GPU computes something else."""
+    if args.gpu:
+        return _gpu(args.again)
     found = examine(Path(args.root))
     if args.json:
         print(json.dumps(found, indent=1, sort_keys=True))
     else:
         print("\n".join(_brief(found) if args.brief else _lines(found)))
     return 2 if found["missing"] or found["kernel"] else 0
+
+
+def _gpu(again: bool) -> int:
+    """One line about the GPU; 2 where it is wrong.
+
+    Raises:
+        DeviceError: there is none.
+    """
+    with lease_device("cuda") as device:
+        from nbavatar.cli.gpu_verdict import gpu_verdict
+        from nbavatar.studies.benchmarks.device_check import verdict
+
+        found, known = gpu_verdict(device, again=again)
+    print(verdict(found) + (" (found before; --again looks anew)" if known else ""))
+    return 0 if found["right"] else 2
 
 
 def third_party(verb: str) -> set[str]:

@@ -67,6 +67,12 @@ def main(args: argparse.Namespace) -> int:
         if not Path(path).is_file():
             raise DataError.of(path, expected=f"a file (--{name.partition('.')[0]})", found="no such file")
     with lease_device(args.device) as device:
+        if device == "cuda":
+            from nbavatar.cli.gpu_verdict import require_right_gpu  # provenance: neutral, it only looks
+
+            line = require_right_gpu(device)
+            if line is not None:
+                print(line, file=sys.stderr)
         record = run_record(
             "train",
             config=own_options(to_mapping(config)),

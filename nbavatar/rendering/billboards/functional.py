@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nbavatar.errors import DataError, DeviceError
+from nbavatar.errors import DataError, DependencyError, DeviceError
 from nbavatar.rendering.billboards.projection import project_billboards, texture_support
 from nbavatar.rendering.billboards.reference import BlendSettings, blend_reference
 from nbavatar.rendering.ordering import canonical_rank, parse_order
 from nbavatar.rendering.patches import ProjectedPatches
+from nbavatar.rendering.plain import announce_plain_torch
 
 __all__ = ["render_billboards"]
 
@@ -73,7 +74,8 @@ def render_billboards(
         t_min: a pixel is finished once its transmittance is under this.
         low_pass: least half-extent of a billboard on screen [px]. A smaller one is widened to it
             and dimmed so that its alpha summed over the image stays; 0 turns this off.
-        backend: `auto` takes the kernels for the tensors' device; `reference` is the slow oracle.
+        backend: `auto` takes the kernels for the tensors' device; `reference` is the slow oracle, which also stands in,
+            and says so, on a GPU for which no kernel can be compiled.
 
     Returns:
         Premultiplied features (C, H, W) and alpha (H, W), each with a leading B where `viewmat` or
@@ -82,7 +84,7 @@ def render_billboards(
     Raises:
         DataError: a shape, dtype, device, option or value is wrong; one line says which.
         DeviceError: the backend asked for does not fit the tensors' device.
-        DependencyError: tensors are on a GPU and the package numba-cuda is missing.
+        DependencyError: `cuda` is asked for and the package numba-cuda is missing.
     """
     if features is None and isinstance(alpha, Tensor):
         features = alpha.new_zeros(*alpha.shape, 0)
@@ -112,8 +114,13 @@ def _backend(name: str, device: torch.device) -> tuple[_Project, _Blend]:
     """Projection and blending on a device."""
     if name not in _BACKENDS:
         raise DataError.of(_WHERE, "backend", expected=f"one of {', '.join(_BACKENDS)}", found=repr(name))
+    if name == "auto" and device.type == "cuda":
+        try:
+            return _backend("cuda", device)
+        except DependencyError as error:
+            announce_plain_torch("billboards", error)
     if name == "auto":
-        name = device.type if device.type in ("cpu", "cuda") else "reference"
+        name = "cpu" if device.type == "cpu" else "reference"
     if name == "reference":
         return project_billboards, blend_reference
     if name == "cpu" and device.type == "cpu":

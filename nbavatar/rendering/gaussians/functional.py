@@ -7,11 +7,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nbavatar.errors import DataError, DeviceError
+from nbavatar.errors import DataError, DependencyError, DeviceError
 from nbavatar.rendering.gaussians.projection import camera_centre, project_gaussians
 from nbavatar.rendering.gaussians.reference import SplatSettings, blend_reference
 from nbavatar.rendering.gaussians.spherical_harmonics import DEGREES, harmonic_colours, harmonic_count
 from nbavatar.rendering.ordering import canonical_rank
+from nbavatar.rendering.plain import announce_plain_torch
 
 __all__ = ["SplatImage", "render_gaussians"]
 
@@ -92,7 +93,8 @@ def render_gaussians(
         backend: `cpu` and `cuda` blend with our kernels (tensors on a GPU are projected there and copied for
             `cpu`); `gsplat` takes that package, on a GPU, with the restrictions that
             `gsplat_backend.py` names; `auto` is `cpu`, and on a GPU `gsplat` where it is installed,
-            else `cuda`; `reference` is the slow oracle, on any device.
+            else `cuda`; `reference` is the slow oracle, on any device, which also stands in, and says so, on a GPU
+            for which no kernel can be compiled.
 
     Returns:
         A SplatImage in the widest dtype of the first five tensors, at least float32. Gradients reach
@@ -101,7 +103,7 @@ def render_gaussians(
     Raises:
         DataError: a shape, dtype, device, option or value is wrong; one line says which.
         DeviceError: the backend asked for does not fit the tensors' device.
-        DependencyError: the backend's package, gsplat or numba-cuda, is missing.
+        DependencyError: the package of the backend that is asked for, gsplat or numba-cuda, is missing.
     """
     _check_tensors(means, quats, scales, opacities, colours, viewmat, K, screen_offsets)
     _check_options(width, height, near, low_pass, alpha_min, alpha_max, t_min)
@@ -145,8 +147,15 @@ def _resolve(name: str, device: torch.device) -> str:
     if name not in _BACKENDS:
         raise DataError.of(_WHERE, "backend", expected=f"one of {', '.join(_BACKENDS)}", found=repr(name))
     on_gpu = device.type == "cuda"
+    if name == "auto" and on_gpu and importlib.util.find_spec("gsplat") is None:
+        try:
+            import nbavatar.rendering.gaussians.cuda  # noqa: F401  (raises where it cannot be used)
+        except DependencyError as error:
+            announce_plain_torch("Gaussians", error)
+            return "reference"
+        return "cuda"
     if name == "auto":
-        return "cpu" if not on_gpu else "cuda" if importlib.util.find_spec("gsplat") is None else "gsplat"
+        return "gsplat" if on_gpu else "cpu"
     simulated = name == "cuda" and os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
     if name in ("gsplat", "cuda") and not (on_gpu or simulated):
         raise DeviceError.of(_WHERE, "backend", expected=f"tensors on cuda for '{name}'",
