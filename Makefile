@@ -12,10 +12,10 @@ TORCH ?= auto
 # to import torch: it is written once, into .venv and beside our own modules.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install smoke capture paper rehearsal test test-fast bench lint format ci lock clean help
+.PHONY: install smoke capture paper rehearsal rehearsal-small test test-fast bench lint format ci lock clean help
 
 help:  ## list the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 18
 
 install:  ## make .venv with everything in it (pip only, no compiler); TORCH=auto|cpu|cuda says which build of torch
 	@$(PYTHON) tools/install.py --venv $(VENV) --torch $(TORCH)
@@ -32,6 +32,10 @@ paper: install  ## every table of the paper; needs the Decaf dataset and the bod
 
 rehearsal: install  ## the paper on synthetic data of the dataset's size, in few frames and steps; hours on two cores
 	$(BIN)/nbavatar run rehearsal --cores $(CORES)
+
+SMALL := config/paper.yaml config/rehearsal.yaml config/rehearsal/small.yaml
+rehearsal-small: install  ## the smallest rehearsal at true size: one synthetic subject, three cameras, every rule
+	$(BIN)/nbavatar run rehearsal --cores $(CORES) -- --configfile $(SMALL)
 
 # One thread a worker: two tests side by side are faster than one after the other on two threads. Files are begun in the
 # order of tests/conftest.py, long ones first, not by how many tests they hold.

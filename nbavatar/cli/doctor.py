@@ -7,7 +7,9 @@ run, 2 if a package for it is missing or no kernel can be compiled; body models 
 only and do not count. With --brief one line: that all is well, or the first thing that is missing and what to do.
 With --gpu one line about the GPU instead: whether its kernels compute what the float64 reference computes, forward
 and backward, and how long a frame takes; exit code 2 if they do not. It is found once for a card and a version, and
-`train` finds it before the first training on a GPU. With --json all the other findings as one JSON object:
+`train` finds it before the first training on a GPU. With --plan what `nbavatar run paper` will cost on the real dataset,
+by rule, here and on a GPU, and what smaller budgets would save and give up. With --json all the other findings as one
+JSON object:
 
   machine      processors, memory_gb, disk_free_gb, gpus [names]
   kernel       null, or why no kernel can be compiled and run
@@ -32,6 +34,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from nbavatar.cli.doctor_plan import add_plan_arguments, plan_costs, plan_lines
 from nbavatar.devices import lease_device
 from nbavatar.errors import NBAvatarError
 from nbavatar.gpus import list_gpus
@@ -59,6 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     form.add_argument("--brief", action="store_true", help="print one line: all is well, or what is missing first")
     form.add_argument("--gpu", action="store_true", help="compare this machine's GPU with the reference and time it")
     parser.add_argument("--again", action="store_true", help="with --gpu: do it anew, where it was done before")
+    parser.add_argument("--plan", action="store_true", help="say what the paper's run will cost instead")
+    add_plan_arguments(parser)
     parser.add_argument(
         "--root",
         default="resources/DecafDataset",
@@ -71,6 +76,10 @@ def main(args: argparse.Namespace) -> int:
     """Prints the findings; 2 if the synthetic pipeline cannot run, or the GPU computes something else."""
     if args.gpu:
         return _gpu(args.again)
+    if args.plan:
+        plan = plan_costs(args.frames, args.gpu_ms, _processors())
+        print(json.dumps(plan, indent=1) if args.json else "\n".join(plan_lines(plan)))
+        return 0
     found = examine(Path(args.root))
     if args.json:
         print(json.dumps(found, indent=1, sort_keys=True))
@@ -210,12 +219,16 @@ def _machine() -> dict[str, Any]:
             problem = str(error)
     return {
         "python": sys.version.split()[0],
-        "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "processors": _processors(),
         "memory_gb": round(pages / 2**30, 1),
         "disk_free_gb": round(shutil.disk_usage(".").free / 2**30, 1),
         "gpus": gpus,
         "gpu_problem": problem,
     }
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _version(name: str) -> str:

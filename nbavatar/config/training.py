@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any
 from nbavatar.config.core import option
 from nbavatar.methods.registry import METHODS, options_class
 
-__all__ = ["TrainConfig", "own_options"]
+__all__ = ["STEPS", "TrainConfig", "own_options"]
+
+STEPS = {"paper": 400_000, "fast": 40_000}
+"""Steps of the two schedules, where neither the options nor the method name another number."""
 
 _PARTS = ("head", "right_hand", "left_hand", "shell")
 

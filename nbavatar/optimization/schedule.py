@@ -12,11 +12,9 @@ under a time budget are not bit-identical.
 import math
 from typing import NamedTuple
 
-from nbavatar.config.training import TrainConfig
+from nbavatar.config.training import STEPS, TrainConfig
 
 __all__ = ["Plan", "plan_at", "total_steps"]
-
-_STEPS = {"paper": 400_000, "fast": 40_000}
 
 
 class Plan(NamedTuple):
@@ -39,7 +37,7 @@ class Plan(NamedTuple):
 
 def total_steps(config: TrainConfig) -> int:
     """Number of optimization steps when no time budget is given."""
-    return config.steps if config.steps is not None else _STEPS[config.schedule]
+    return config.steps if config.steps is not None else STEPS[config.schedule]
 
 
 def plan_at(progress: float, config: TrainConfig, side: int, step: int = 0) -> Plan:

@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 
 from nbavatar.cli import doctor, main
 
@@ -84,3 +86,26 @@ def test_a_compiler_that_does_not_work_counts(tmp_path, capsys, monkeypatch):
 def test_needs_of_a_verb_are_read_from_its_code():
     assert {"cv2", "numpy", "numba"} <= doctor.third_party("masks")
     assert "cv2" not in doctor.third_party("train")
+
+
+def test_the_plan_of_the_paper_says_hours_memory_and_disk_of_every_rule(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)  # no configuration here: that of the project
+    assert main(["doctor", "--plan", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    rules = {part["rule"]: part for part in found["rules"]}
+    assert rules["train"]["jobs"] == 28 and not rules["train"]["unmeasured"] and rules["train"]["core_hours"] > 0
+    assert found["total"]["hours_here"] > found["total"]["hours_gpu"] > 0
+    assert all(one["hours_here"] < found["total"]["hours_here"] and one["gives_up"] for one in found["budgets"])
+    assert found["largest_memory_mb"] == max(part["memory"] for part in rules.values())
+    assert main(["doctor", "--plan", "--frames", "163", "--gpu-ms", "2.9"]) == 0
+    text = capsys.readouterr().out
+    assert "163 frames a camera" in text and "one picture in 2.9 ms" in text and "gives up" in text
+    assert main(["doctor", "--plan", "--frames", "0"]) == 2
+
+
+def test_the_plan_imports_no_computing_packages():
+    """Importing torch alone would take the seconds that the plan has."""
+    code = "import sys; from nbavatar.cli import main; main(['doctor', '--plan']); "
+    code += "print({'torch', 'numpy'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "set()"

@@ -16,7 +16,7 @@ ALLOWED = {
     "table": {"difference"},  # the printed numbers beside ours all the same
     "video": {"max_frames", "seconds"},
 }
-ALLOWED_SMALL = ALLOWED | {"": ALLOWED[""] | {"subjects", "only", "reenact"}}
+ALLOWED_SMALL = ALLOWED | {"": ALLOWED[""] | {"subjects", "runs", "only", "reenact"}}
 
 
 def _laid_over(*names):

@@ -1,0 +1,100 @@
+"""What a run will cost: the line through measured jobs, and how many jobs of which size there are."""
+
+import math
+
+import pytest
+
+from nbavatar.config.tradeoff import read_sheet
+from nbavatar.errors import DataError
+from nbavatar.planning.costs import Work, cost_of, read_costs, sweep_pictures, workload
+from tests.unit.planning.plans import ROOT, shipped
+
+SHEET = read_sheet({"knobs": {"order": ["center"]}, "images": 2, "repeats": 3, "warmup": 1}, "sheet")
+
+
+def _sheet(tmp_path, *rows):
+    path = tmp_path / "costs.tsv"
+    lines = ["rule", "of", "unit", "units", "cpu_s", "peak_mb", "out_mb"], *rows
+    path.write_text("".join("\t".join(map(str, line)) + "\n" for line in lines))
+    return path
+
+
+def test_the_cost_of_another_size_lies_on_the_line_through_two_measured_ones(tmp_path):
+    costs = read_costs(
+        _sheet(tmp_path, ("ingest", "", "frames", 4, 3.0, 150, 8), ("ingest", "", "frames", 8, 5.0, 140, 16))
+    )
+    cost = costs["ingest", ""]
+    assert (cost.seconds.at(4), cost.seconds.at(8), cost.seconds.at(104)) == (3.0, 5.0, 53.0)
+    assert cost.disk.at(100) == pytest.approx(200.0)
+    # Noise may make a larger job look smaller: it is never taken to shrink further.
+    assert cost.memory.at(1000) == 150 and cost.sizes == (4.0, 8.0)
+
+
+def test_one_measured_size_is_taken_in_proportion_and_a_job_as_it_is(tmp_path):
+    rows = (
+        ("render", "full", "images", 4, 8.0, 900, 2),
+        ("table", "", "job", 1, 2.0, 100, 0.1),
+        ("table", "", "job", 1, 4.0, 120, 0.1),
+    )
+    costs = read_costs(_sheet(tmp_path, *rows))
+    assert costs["render", "full"].seconds.at(10) == 20.0 and costs["render", "full"].memory.at(10) == 900
+    assert costs["table", ""].seconds.at(1) == 3.0 and costs["table", ""].memory.at(1) == 120
+    assert cost_of(costs, Work("render", "new", "images", 1, 1)) is costs["render", "full"]
+    assert cost_of(costs, Work("video", "", "frames", 1, 1)) is None
+
+
+def test_another_sheet_is_refused_in_one_line(tmp_path):
+    with pytest.raises(DataError, match="row 2: expected numbers"):
+        read_costs(_sheet(tmp_path, ("ingest", "", "frames", 4, "long", 150, 8)))
+    path = tmp_path / "other.tsv"
+    path.write_text("a\tb\n1\t2\n")
+    with pytest.raises(DataError, match="header: expected rule, of, unit"):
+        read_costs(path)
+
+
+def test_the_work_of_the_paper_is_that_of_its_sheets():
+    plan = shipped("paper")
+    works = workload(plan, 1630, SHEET)
+    jobs = {}
+    for work in works:
+        jobs[work.rule] = jobs.get(work.rule, 0) + work.jobs
+    assert jobs == {
+        "ingest": 32, "masks": 32, "crop": 64, "tracks": 4, "fit": 4, "spectral": 4, "deform": 4, "reenact": 4,
+        "reenact_contact": 4, "train": 28, "render": 48, "evaluate": 48, "speed": 7, "video": 8, "tradeoff": 1,
+        "savings": 1, "offline": 1, "extremes": 1, "collect": 1, "report": 1, "table": 8, "figure": 10,
+    }  # fmt: skip
+    steps = {work.of: work.count for work in works if work.rule == "train"}
+    assert steps["full"] == steps["no_dnr"] == 400_000
+    assert (steps["gaussian_avatars"], steps["splatting_avatar"]) == (600_000, 30_000)
+    images = {work.count for work in works if work.rule == "render" and work.of == "full"}
+    assert images == {1630 - 326, 326 * 7}  # novel views of training frames; held-out frames in seven cameras
+    assert sweep_pictures(SHEET) == 2 * (2 + 2 * 4)
+
+
+def test_memory_grows_only_where_it_was_seen_to_and_models_do_not_grow_with_steps(tmp_path):
+    rows = [("fit", "", "views", 8, 3, 400, 1), ("fit", "", "views", 16, 4, 500, 2)]
+    rows += [("masks", "", "frames", 4, 2, 383, 1), ("masks", "", "frames", 8, 4, 389, 2)]
+    rows += [("train", "full", "steps", 1, 75, 8000, 795)]
+    costs = read_costs(_sheet(tmp_path, *rows))
+    assert costs["fit", ""].memory.at(32) == 700 and costs["masks", ""].memory.at(1630) == 389
+    assert costs["train", "full"].disk.at(400_000) == 795 and costs["train", "full"].seconds.at(10) == 750
+
+
+def test_what_the_paper_spends_its_time_on_was_measured():
+    costs = read_costs(ROOT / "config/costs.tsv")
+    works = workload(shipped("paper"), 1630, SHEET)
+    lacking = {work.rule for work in works if cost_of(costs, work) is None}
+    assert not lacking & {
+        "ingest",
+        "masks",
+        "crop",
+        "tracks",
+        "fit",
+        "spectral",
+        "deform",
+        "train",
+        "render",
+        "evaluate",
+    }
+    for cost in costs.values():
+        assert all(math.isfinite(line.at(1e6)) and line.slope >= 0 for line in (cost.seconds, cost.memory, cost.disk))
