@@ -7,9 +7,9 @@ run, 2 if a package for it is missing or no kernel can be compiled; body models 
 only and do not count. With --brief one line: that all is well, or the first thing that is missing and what to do.
 With --gpu one line about the GPU instead: whether its kernels compute what the float64 reference computes, forward
 and backward, and how long a frame takes; exit code 2 if they do not. It is found once for a card and a version, and
-`train` finds it before the first training on a GPU. With --plan what `nbavatar run paper` will cost on the real dataset,
-by rule, here and on a GPU, and what smaller budgets would save and give up. With --json all the other findings as one
-JSON object:
+`train` finds it before the first training on a GPU. With --plan what `nbavatar run paper` will cost on the real
+dataset, by rule, here and on a GPU, and what smaller budgets would save and give up. With --json all the other findings
+as one JSON object:
 
   machine      processors, memory_gb, disk_free_gb, gpus [names]
   kernel       null, or why no kernel can be compiled and run
