@@ -34,7 +34,10 @@ _BUDGETS: tuple[tuple[str, dict[str, Any], str], ...] = (
 
 @dataclasses.dataclass(frozen=True)
 class _Planned:
-    """Jobs of one rule together: hours of a core, hours on the GPU, most memory of a job [MB], disk [MB]."""
+    """Jobs of one rule together: hours of a core, hours on the GPU, most memory of a job [MB], disk [MB].
+
+    `one_size` where the jobs work on frames and were measured for one number of them: memory may grow unseen.
+    """
 
     rule: str
     jobs: int
@@ -43,6 +46,7 @@ class _Planned:
     memory: float
     disk: float
     unmeasured: bool
+    one_size: bool
 
 
 def add_plan_arguments(parser: argparse.ArgumentParser) -> None:
@@ -114,7 +118,7 @@ def _by_rule(works: Sequence[Work]) -> list[tuple[str, list[Work]]]:
 
 def _sum(rule: str, works: Sequence[Work], costs: Any, faster: float) -> _Planned:
     seconds = memory = disk = 0.0
-    unmeasured = False
+    unmeasured = one_size = False
     for work in works:
         cost = cost_of(costs, work)
         if cost is None:
@@ -122,10 +126,11 @@ def _sum(rule: str, works: Sequence[Work], costs: Any, faster: float) -> _Planne
             continue
         seconds += work.jobs * cost.seconds.at(work.count)
         memory = max(memory, cost.memory.at(work.count))
+        one_size |= work.unit in ("frames", "views") and len(cost.sizes) == 1
         disk += work.jobs * cost.disk.at(work.count)
     hours = seconds / 3600.0
     jobs = sum(work.jobs for work in works)
-    return _Planned(rule, jobs, hours, hours / faster if rule in ON_GPU else hours, memory, disk, unmeasured)
+    return _Planned(rule, jobs, hours, hours / faster if rule in ON_GPU else hours, memory, disk, unmeasured, one_size)
 
 
 def _total(parts: Sequence[_Planned], cores: int, *, train_share: float = 1.0) -> dict[str, float]:
@@ -159,12 +164,17 @@ def plan_lines(found: dict[str, Any]) -> list[str]:
             f"{part['core_hours'] / cores:,.1f}",
             f"{part['gpu_hours'] / (1 if part['rule'] in ON_GPU else cores):,.1f}",
         )
-        memory, disk = f"{part['memory'] / 1000:.1f} GB", f"{part['disk'] / 1000:,.1f} GB"
+        memory, disk = (
+            f"{part['memory'] / 1000:.1f} GB{'*' if part['one_size'] else ''}",
+            f"{part['disk'] / 1000:,.1f} GB",
+        )
         words = ("not measured", "", "", "") if part["unmeasured"] else (*hours, memory, disk)
-        lines.append(f"{part['rule']:<16}{part['jobs']:>5}{words[0]:>13}{words[1]:>12}{words[2]:>15}{words[3]:>11}")
+        line = f"{part['rule']:<16}{part['jobs']:>5}{words[0]:>13}{words[1]:>12}{words[2]:>15}{words[3]:>11}"
+        lines.append(line.rstrip())
     lines += [
         f"all        {total['hours_here']:,} hours here, {total['hours_gpu']:,} with the GPU, {total['disk_gb']:,} GB "
         f"of disk, at most {found['largest_memory_mb'] / 1000:.1f} GB of memory a job",
+        "           * measured for one number of frames: memory for more may be larger",
         f"           disk is that of synthetic pictures, which compress well; noisy footage takes up to "
         f"{found['disk_at_most_gb']:,} GB in frame packs",
         f"shared     stages before training are made once a subject; once a variant they would take "

@@ -23,7 +23,7 @@ from nbavatar.planning.run import Plan
 __all__ = ["Cost", "Line", "Work", "cost_of", "read_costs", "workload"]
 
 _COLUMNS = ("rule", "of", "unit", "units", "cpu_s", "peak_mb", "out_mb")
-ON_GPU = ("train", "render", "video", "speed", "tradeoff", "savings")
+ON_GPU = ("train", "render", "evaluate", "video", "speed", "tradeoff", "savings")
 """Rules whose jobs lease a GPU where there is one."""
 
 _GROWTH = 1.1  # of memory, from the smaller measured size to the larger one
