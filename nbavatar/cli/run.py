@@ -62,7 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             own.add_argument("folder", metavar="FOLDER", help="the capture")
         if name in _OF_THE_PAPER:
             own.add_argument("--subjects", nargs="+", metavar="NAME", help="only these (default: all of the sheet)")
-        own.add_argument("--cores", type=int, metavar="N", help="processors to use (default: all)")
+        own.add_argument("--cores", type=int, metavar="N", help="processors to use, on a cluster by one job "
+                         "(default: all of this machine, as many as a job has threads)")  # fmt: skip
         own.add_argument("--profile", metavar="NAME", help="where jobs run, if not on this machine: slurm, kubernetes, "
                          "or the folder of a profile of snakemake's")  # fmt: skip
 
@@ -121,14 +122,16 @@ def _own_command() -> str:
 
 
 def _snakemake(args: argparse.Namespace, source: Path) -> list[str]:
-    cores = str(args.cores or os.cpu_count() or 2)
-    words = [sys.executable, "-m", "snakemake", "--snakefile", str(source / "Snakefile"), "--cores", cores]
+    given = read_words(args.snakemake)
+    words = [sys.executable, "-m", "snakemake", "--snakefile", str(source / "Snakefile")]
+    # Snakemake limits every job's threads by it, those of other machines too.
+    if args.cores or executor_of(given, source, args.profile or "") in ("", "local"):
+        words += ["--cores", str(args.cores or os.cpu_count() or 2)]
     if args.profile is not None:
         words += ["--workflow-profile", str(_profile(args.profile, source))]
     elif args.what == "smoke":
         words += ["--workflow-profile", str(source / "profiles" / "ci")]
     words += args.snakemake
-    given = read_words(args.snakemake)
     configfiles = given.configfiles or _LAYERED.get(args.what, (f"config/{args.what}.yaml",))
     check_files(given, configfiles, source)
     if not given.configfiles:

@@ -34,11 +34,16 @@ COMMAND = [sys.executable, "-m", "snakemake", "--workflow-profile", str(ROOT / "
 # second from what it has saved; a job is killed for its memory in its first.
 WORKFLOW = """
 rule all:
-    input: expand("gpu{i}", i=range(3)), "long", "large"
+    input: expand("gpu{i}", i=range(3)), "long", "large", "wide"
 
 rule train:
     output: "gpu{i}"
     shell: "{sys.executable} hold.py $PWD/held > {output}"
+
+rule wide:
+    output: "wide"
+    threads: 3
+    shell: "echo $OMP_NUM_THREADS $SLURM_CPUS_PER_TASK > {output}"
 
 rule long:
     output: "long"
@@ -76,6 +81,7 @@ def test_devices_limits_and_retries(tmp_path):
     assert done.returncode == 0, said[-6000:]
     assert {(tmp_path / f"gpu{i}").read_text().strip() for i in range(3)} <= {"0", "1"}
     assert not list(tmp_path.glob("held.*"))
+    assert (tmp_path / "wide").read_text() == "3 3\n"  # a processor a thread
     for name in ("long", "large"):
         assert (tmp_path / name).read_text() == "x\nx\n", name  # the second attempt met what the first had left
 

@@ -202,6 +202,10 @@ def test_a_profile_takes_the_place_of_the_warm_run(calls, tmp_path, monkeypatch,
     assert ours[:2] == [sys.executable, "-m"] and ours == folder  # not warm: its jobs are elsewhere
     assert ours[ours.index("--workflow-profile") + 1] == slurm
     assert own[0] != "warm" and own[-4:-2] == ["--workflow-profile", "slurm"]
+    # Jobs of other machines are not limited by the processors of this one, unless somebody says so.
+    assert not any("--cores" in words for words in calls)
+    assert main(["run", "smoke", "--cores", "3", "--profile", "slurm"]) == 0
+    assert calls[-1][calls[-1].index("--cores") + 1] == "3"
     assert main(["run", "smoke", "--profile", "slrum"]) == 2
     assert "slrum: expected a folder with a profile.yaml in it, or one of ci, " in capsys.readouterr().err
 
