@@ -10,7 +10,11 @@ checked that no process of the run goes on for longer than the time in which it 
 Compared to the last digit: all values of all tables but measured times and memory, tables without such in all formats
 but for digests of files that hold times, and every evaluated figure. Exit code 0 if all are the same, no temporary file
 is left, and no process outlived its run; 1 otherwise. `--longest` should be about a quarter of what the run takes, so
-that all its parts are hit.
+that all its parts are hit; with `--begun` the run that is killed starts with what the unbroken one made of some stages,
+so that short ones hit what comes late:
+
+    python tests/workflow/killed_smoke.py --whole /tmp/killed/whole --folder /tmp/late --longest 40 --begun \\
+        ingest tracks masks crop fit spectral deform train extremes
 """
 
 import argparse
@@ -18,6 +22,7 @@ import csv
 import json
 import random
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -38,6 +43,9 @@ def main() -> int:
     parser.add_argument("--targets", nargs="*", default=[], help="targets of Snakemake instead of the whole run")
     parser.add_argument("--folder", type=Path, required=True, help="a new folder for both runs")
     parser.add_argument("--whole", type=Path, help="folder of an unbroken run that was made before")
+    parser.add_argument(
+        "--begun", nargs="*", default=[], metavar="STAGE", help="stages whose results are there already"
+    )
     arguments = parser.parse_args()
     draw = random.Random(arguments.seed)
     print(f"seed {arguments.seed}, {arguments.kills} kills", flush=True)
@@ -50,6 +58,8 @@ def main() -> int:
             print(f"the unbroken run failed: {(whole / 'log').read_text()[-3000:]}")
             return 1
         print(f"unbroken run: {time.monotonic() - began:.0f} s", flush=True)
+    if arguments.begun:
+        begin(whole, broken, arguments.begun)
     faults, done = [], 0
     while done < arguments.kills:
         delay = draw.uniform(1.0, arguments.longest)
@@ -88,6 +98,12 @@ def main() -> int:
     faults += [f"left: {path}" for path in broken.rglob(".*.tmp*")]
     print("\n".join(faults) or f"{done} kills survived: the same tables, nothing left")
     return 1 if faults else 0
+
+
+def begin(whole: Path, broken: Path, stages: list[str]) -> None:
+    """Copies the dataset and some stages of the unbroken run, with their times and what Snakemake knows of them."""
+    for name in ("config", "resources", ".snakemake", *(f"results/smoke/{stage}" for stage in stages)):
+        shutil.copytree(whole / name, broken / name, symlinks=True)
 
 
 def run(folder: Path, targets: list[str]) -> "subprocess.Popen[bytes]":
