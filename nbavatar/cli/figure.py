@@ -57,15 +57,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--layout", default="config/figures.yaml", metavar="YAML", help="layout of the figures")
     for name, kind, text in _INPUTS:
         parser.add_argument(f"--{name}", nargs="*", default=[], metavar=kind, help=text)
+    parser.add_argument("--size-label", default="", metavar="TEXT", help="why it is not what the paper shows")
     parser.add_argument("--out-stem", required=True, metavar="STEM", help="where to write, without suffix")
 
 
 def main(args: argparse.Namespace) -> int:
     """Draws one figure."""
-    from nbavatar.reporting.figures import save_figure
+    from nbavatar.reporting.figures import label_figure, save_figure
 
     layout = choose_figure(read_figures(args.layout), args.figure, args.layout)
     drawn = _draw(args, layout)
+    label_figure(drawn.figure, args.size_label)
     for suffix in ("png", "pdf"):
         with atomic_write(f"{args.out_stem}.{suffix}") as path:
             save_figure(drawn.figure, path)
@@ -73,6 +75,7 @@ def main(args: argparse.Namespace) -> int:
     inputs = {"layout": args.layout} | {f"inputs.{i}": path for i, path in enumerate(files)}
     record = run_record("figure", config={"figure": args.figure} | to_mapping(layout), inputs=inputs)
     content = {"kind": "figure", "title": layout.title, "caption": layout.caption, "shown": drawn.shown}
+    content |= {"label": args.size_label} if args.size_label else {}
     write_json(f"{args.out_stem}.json", content | {"record": record})
     print(f"{args.out_stem}.png: {', '.join(drawn.shown) or 'nothing to show'}")
     return 0

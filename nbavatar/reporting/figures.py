@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["curves_figure", "save_figure", "sensitivity_figure"]
+__all__ = ["curves_figure", "label_figure", "save_figure", "sensitivity_figure"]
 
 _AXES = (
     ("psnr", "PSNR [dB]"),
@@ -107,6 +107,12 @@ def _label_decades(axis: "Axes") -> None:
     places = ticks(low, high, True)
     axis.set_yticks([10**place for place, _ in places], [label for _, label in places])
     axis.set_yticks([], minor=True)
+
+
+def label_figure(figure: "Figure", label: str) -> None:
+    """Writes along the lower edge why a figure does not show what the paper's does; an empty label changes nothing."""
+    if label:
+        figure.text(0.005, 0.005, label.replace("$", r"\$"), fontsize=7, color="0.35", ha="left", va="bottom")
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

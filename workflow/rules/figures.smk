@@ -120,9 +120,11 @@ rule figure:
         runtime="30m",
     params:
         stem=lambda w, output: output.png[:-4],
+        label=RUN.size_label,
         given=given_digest([RUN.figures] if RUN.figures else []),
         code=lambda w: parameters.figure_code(PLAN, w.figure),
     shell:
         "nbavatar figure --figure {wildcards.figure:q} --layout {input.layout:q} --renders {input.renders:q}"
         " --frames {input.frames:q} --evals {input.evals:q} --speeds {input.speeds:q} --histories {input.histories:q}"
-        " --models {input.models:q} --sequences {input.sequences:q} --out-stem {params.stem:q} > {log:q} 2>&1"
+        " --models {input.models:q} --sequences {input.sequences:q} --size-label={params.label:q}"
+        " --out-stem {params.stem:q} > {log:q} 2>&1"

@@ -14,6 +14,7 @@ from nbavatar.config.figures import FigureColumn, FigureLayout, read_figures
 from nbavatar.data.sequences import MeshSequence, Part
 from nbavatar.errors import ConfigError
 from nbavatar.io.framepack import FramePack, FramePackWriter
+from nbavatar.io.images import decode_image
 from nbavatar.reporting.comparison import Rendered, frames_in_contact
 from nbavatar.reporting.contact import best_camera, deepest_frames, dent_pictures, dent_scale
 from nbavatar.reporting.gallery import comparison_drawn, curves_drawn
@@ -176,6 +177,22 @@ def test_every_figure_of_the_layout_is_drawn_the_same_twice(group, tmp_path):
         assert both[0] == both[1]
         record = json.loads((tmp_path / f"{name}1.json").read_text())
         assert record["record"]["command"] == "figure" and bool(record["shown"]) == (name != "pareto")
+
+
+def test_a_rehearsal_is_written_on_its_figures_along_the_lower_edge(tmp_path):
+    history = tmp_path / "S2" / "full" / "history.jsonl"
+    history.parent.mkdir(parents=True)
+    history.write_text("\n".join(json.dumps({"step": s, "mse": 1 / (1 + s)}) for s in range(3)))
+    layout = tmp_path / "figures.yaml"
+    layout.write_text("training: {kind: curves}\n")
+    words = ["figure", "--figure", "training", "--layout", str(layout), "--histories", str(history), "--out-stem"]
+    assert main([*words, str(tmp_path / "plain")]) == 0
+    assert main([*words, str(tmp_path / "marked"), "--size-label", "rehearsal, $2 steps"]) == 0
+    plain, marked = (decode_image(tmp_path / f"{name}.png") for name in ("plain", "marked"))
+    rows = np.flatnonzero((plain != marked).any((1, 2)))
+    assert len(rows) and rows.min() > 0.9 * len(plain)
+    assert json.loads((tmp_path / "marked.json").read_text())["label"] == "rehearsal, $2 steps"
+    assert "label" not in json.loads((tmp_path / "plain.json").read_text())
 
 
 def test_no_label_of_training_curves_is_cut_off():
