@@ -3,6 +3,10 @@
     nbavatar bench train --json
     nbavatar bench train --size 512 --width 16 --convs 1 --device cpu
     nbavatar bench train --size 256 --config config/capture.yaml     # as that run trains; sizes are its own
+    nbavatar bench train --size 256 --config config/capture.yaml --against '{unet: {form: paper}}'
+
+With --against, options of the billboards that another training differs by, its steps are made in turns with those of
+the first: `against_cpu_ms`, and `against_ratio`, the median over the turns of its processor time by the first's.
 
 One avatar of a full-size head and hand (11,514 billboards of FLAME and MANO), one view of --size pixels whose window
 is the whole picture. Each part is run alone, forward and backward, on the same tensors as in the step; the sum of the
@@ -22,8 +26,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nbavatar.config.core import from_mapping, merge, to_mapping
 from nbavatar.config.training import TrainConfig
+from nbavatar.config.yamlfiles import parse_yaml
 from nbavatar.devices import device_name, lease_device, peak_memory_mb
+from nbavatar.errors import ConfigError, describe
 from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.losses import loss_delta, loss_knn
 from nbavatar.methods.billboards.options import BillboardsConfig, UNetConfig
@@ -45,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--texels", type=int, default=16, help="texels a side (default: %(default)s)")
     parser.add_argument("--lpips-crop", type=int, default=256, help="side of the LPIPS crop [px]")
     parser.add_argument("--precision", default="fp32", choices=("fp32", "bf16"), help="arithmetic of the U-Net")
+    parser.add_argument("--against", metavar="YAML", help="options of another training, whose steps alternate")
     parser.add_argument("--repeats", type=int, default=3, help="runs a median is taken of (default: %(default)s)")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
 
@@ -75,7 +83,38 @@ def _measure(args: argparse.Namespace, device: str) -> dict[str, Any]:
         figures[f"{name}_share"] = figures[f"{name}_cpu_ms"] / sum(figures[f"{other}_cpu_ms"] for other in parts)
     figures["raster_and_data_to_unet"] = (figures["raster_share"] + figures["data_share"]) / figures["unet_share"]
     figures["peak_mb"] = peak_memory_mb(device)
+    if args.against is not None:
+        other = StepScene(args.size, _differing(config, args.against), device)
+        figures |= _turns(scene.stepping(), other.stepping(), args.repeats, device)
     return figures
+
+
+def _differing(config: TrainConfig, text: str) -> TrainConfig:
+    """The options with some of the method's changed.
+
+    Raises:
+        ConfigError: no YAML mapping, an unknown option, or a value out of range.
+    """
+    changes = parse_yaml(text, "--against")
+    if not isinstance(changes, dict):
+        raise ConfigError.of("--against", expected="options of the billboards as a mapping", found=describe(text))
+    own = from_mapping(type(config.own), merge(to_mapping(config.own), changes), "--against")
+    return dataclasses.replace(config, **{config.method: own})
+
+
+def _turns(first: Callable[[], None], other: Callable[[], None], repeats: int, device: str) -> dict[str, float]:
+    """Figures of two kinds of steps, one of each at a time; both kinds of a capture's steps, with LPIPS and without."""
+    times: list[tuple[float, float]] = []
+    for call in (first, other):
+        call()
+    for _ in range(2 * repeats):
+        own, others = (_median(call, 1, device)[1] for call in (first, other))
+        times.append((own, others))
+    return {
+        "own_cpu_ms": statistics.median(own for own, _ in times),
+        "against_cpu_ms": statistics.median(others for _, others in times),
+        "against_ratio": statistics.median(others / own for own, others in times),
+    }
 
 
 def _options(args: argparse.Namespace) -> TrainConfig:
