@@ -12,7 +12,7 @@ TORCH ?= auto
 # to import torch: it is written once, into .venv and beside our own modules.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install smoke capture paper rehearsal rehearsal-small test test-fast bench lint format ci lock clean help
+.PHONY: install smoke capture paper rehearsal rehearsal-small test test-fast bench docs pictures lint format ci lock clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 18

@@ -56,6 +56,7 @@ RUN = {
 # Not run by any test, and why.
 NOT_RUN = {
     "make paper": "it needs Decaf, FLAME and MANO; tests/workflow/test_dag.py plans it",
+    "make rehearsal": "hours; tests/workflow/test_dag.py plans it, and docs/rehearsal.md says which jobs have been run",
     "make capture": "one line around `nbavatar run capture`",
     "nbavatar bench raster --sweep": "tens of minutes: it measures every size in turn",
     "nbavatar bench raster --device cuda": "needs a GPU",

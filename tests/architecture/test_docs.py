@@ -36,3 +36,17 @@ def test_pictures_are_small_and_all_are_shown():
             image.load()
             moving += [path.name] if getattr(image, "n_frames", 1) > 1 else []
     assert moving == ["avatar-moves.webp"]
+
+
+def test_the_site_leads_to_every_page():
+    """`make docs` refuses a page that no list of docs/index.md names; this says so in less than a minute."""
+    lists = (ROOT / "docs" / "index.md").read_text("utf-8") + (ROOT / "docs" / "api" / "index.md").read_text("utf-8")
+    pages = [path for path in PAGES if path.parent.name in ("docs", "api") and path.stem != "index"]
+    assert [path.name for path in pages if not re.search(rf"^{path.stem}$", lists, flags=re.MULTILINE)] == []
+
+
+def test_every_target_of_make_is_one():
+    """A target that is called like a folder (docs) would be up to date for ever."""
+    text = (ROOT / "Makefile").read_text("utf-8")
+    (phony,) = re.findall(r"^\.PHONY: (.*)$", text, flags=re.MULTILINE)
+    assert sorted(phony.split()) == sorted(re.findall(r"^([a-z][a-z-]*):", text, flags=re.MULTILINE))
