@@ -1,5 +1,6 @@
 """Exported files, read by independent readers: the format's own description, plyfile, trimesh, safetensors, ONNX."""
 
+import dataclasses
 import json
 import struct
 
@@ -13,6 +14,8 @@ from torch.nn import functional
 
 from nbavatar.cli import main
 from nbavatar.data.sequences import MeshSequence, read_sequence, write_sequence
+from nbavatar.methods.billboards.avatar import Avatar
+from nbavatar.methods.billboards.unet import FORMS
 from nbavatar.methods.storage import load_avatar, save_avatar
 from nbavatar.rendering.gaussians.functional import render_gaussians
 from tests.scenes.toy import sequence
@@ -215,10 +218,13 @@ def test_tensors_build_the_avatar_again_by_the_schema(tmp_path, meshes) -> None:
 
 
 @pytest.mark.slow
-def test_decoder_gives_the_same_picture_in_onnxruntime(tmp_path) -> None:
+@pytest.mark.parametrize("form", FORMS)
+def test_decoder_gives_the_same_picture_in_onnxruntime(tmp_path, form: str) -> None:
     import onnxruntime
 
     avatar = make_avatar()
+    shape = dataclasses.replace(avatar.architecture, unet_form=form)
+    avatar = Avatar(shape, avatar.part_faces(), avatar.vertex_counts, avatar.billboards).eval()
     save_avatar(tmp_path / "model.pt", avatar)
     assert export(tmp_path / "model.pt", "--to", "decoder", "--out", tmp_path / "d.onnx") == 0
     session = onnxruntime.InferenceSession(str(tmp_path / "d.onnx"), providers=["CPUExecutionProvider"])
