@@ -65,12 +65,13 @@ def left_in(
 ) -> Tensor | None:
     """Which billboards are rasterized in a step; dropout of billboards, not part of the paper.
 
-    Each is left out with a chance that falls linearly from `share` to 0. What is left has to make the picture, so none
-    comes to rely on another that a view that was not trained hides or shifts.
+    What is left has to make the picture, so none comes to rely on another that a view that was not trained hides or
+    shifts. The last part of a training has all of them, as rendering does: opacities that are learnt with some left out
+    cover too much when all are there.
 
     Args:
         count: number of billboards F.
-        share: chance to be left out at the start.
+        share: chance to be left out, of each.
         until: progress in (0, 1] from which on none is left out.
         progress: of the training, in [0, 1].
         random: CPU generator; drawn from only where billboards are left out.
@@ -80,8 +81,7 @@ def left_in(
     """
     if share == 0 or progress >= until:
         return None
-    chance = share * (1.0 - progress / until)
-    return (torch.rand(count, generator=random) >= chance).float().to(device)
+    return (torch.rand(count, generator=random) >= share).float().to(device)
 
 
 def step_loss(
