@@ -25,14 +25,12 @@ class Plan(NamedTuple):
         rate: factor on all learning rates.
         crop: side of the LPIPS crop [px], or None for the whole image.
         perceptual: whether LPIPS is computed, where the method has it in its loss.
-        progress: p, in [0, 1].
     """
 
     shrink: int
     rate: float
     crop: int | None
     perceptual: bool
-    progress: float = 0.0
 
 
 def total_steps(config: TrainConfig) -> int:
@@ -60,4 +58,4 @@ def plan_at(progress: float, config: TrainConfig, side: int, step: int = 0) -> P
             rate = config.final_rate + (1.0 - config.final_rate) * 0.5 * (1.0 + math.cos(math.pi * turn))
     crop = None if progress < config.lpips_full_until or shrink > 1 else config.lpips_crop
     perceptual = step % config.lpips_every == 0 and progress >= config.lpips_from
-    return Plan(shrink, rate, crop, perceptual, progress)
+    return Plan(shrink, rate, crop, perceptual)

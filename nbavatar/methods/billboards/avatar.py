@@ -181,7 +181,6 @@ class Avatar(MeshAvatar):
         roi: bool | None = None,
         order: str | None = None,
         engine: bool = True,
-        shown: Tensor | None = None,
     ) -> Window:
         """Rasterize and decode one view.
 
@@ -191,14 +190,11 @@ class Avatar(MeshAvatar):
             precision: fp32, bf16 or fp16 for the U-Net.
             roi, order: override the avatar's own settings.
             engine: whether the avatar's engine may decode.
-            shown: 1 for billboards of `posed` that are rasterized, 0 for those that are left out, (F,); None: all.
         """
         a = self.architecture
         features, alpha = self.textures()
         if keep is not None:
             features, alpha = features[keep], alpha[keep]
-        if shown is not None:
-            alpha = alpha * shown[:, None, None]
         region = full_region(width, height, self.multiple)
         if a.roi if roi is None else roi:
             region = region_of(posed, viewmat, K, width, height, multiple=self.multiple, margin=a.roi_margin)

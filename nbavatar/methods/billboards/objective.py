@@ -19,7 +19,7 @@ from nbavatar.methods.billboards.options import BillboardsConfig
 from nbavatar.methods.photometric import loss_dssim, loss_l1, loss_mse
 from nbavatar.optimization.schedule import Plan
 
-__all__ = ["Target", "left_in", "step_loss", "target_in"]
+__all__ = ["Target", "step_loss", "target_in"]
 
 _LPIPS_SIDE = 32  # the smallest picture the perceptual nets take, and a multiple of their strides
 
@@ -60,30 +60,6 @@ def target_in(window: Window, sample: Sample) -> Target:
     return Target(planes[:3], planes[3], planes[4], missed)
 
 
-def left_in(
-    count: int, share: float, until: float, progress: float, random: torch.Generator, device: str | torch.device = "cpu"
-) -> Tensor | None:
-    """Which billboards are rasterized in a step; dropout of billboards, not part of the paper.
-
-    What is left has to make the picture, so none comes to rely on another that a view that was not trained hides or
-    shifts. The last part of a training has all of them, as rendering does: opacities that are learnt with some left out
-    cover too much when all are there.
-
-    Args:
-        count: number of billboards F.
-        share: chance to be left out, of each.
-        until: progress in (0, 1] from which on none is left out.
-        progress: of the training, in [0, 1].
-        random: CPU generator; drawn from only where billboards are left out.
-
-    Returns:
-        float32 (F,), 1 for those that are rasterized and 0 for the others; None for all.
-    """
-    if share == 0 or progress >= until:
-        return None
-    return (torch.rand(count, generator=random) >= share).float().to(device)
-
-
 def step_loss(
     avatar: Avatar,
     sample: Sample,
@@ -122,7 +98,6 @@ def step_loss(
         sample.width,
         sample.height,
         precision=options.precision,
-        shown=left_in(len(posed.means), options.dropout, options.dropout_until, plan.progress, random, device),
     )
     target = target_in(window, sample)
     truth = target.colour + (1.0 - target.alpha) * background[:, None, None]

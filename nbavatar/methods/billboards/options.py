@@ -79,10 +79,6 @@ class BillboardsConfig:
     texel_sharing: float = option(
         0.0, "Texels also take the mean gradient of their billboard, so many times; 0 for none, as in the paper.", min=0
     )
-    dropout: float = option(
-        0.0, "Chance of each billboard to be left out of a step; not part of the paper.", min=0, max=0.9
-    )
-    dropout_until: float = option(1.0, "Share of training after which none is left out.", min=0, max=1)
     clip: float = option(0.0, "Largest gradient norm of the renderer; 0 = no clipping.", min=0)
     refine: RefineConfig = option(RefineConfig, "Compensation of fitting errors.")
     roi: bool = option(True, "Decode only a window around the avatar.")

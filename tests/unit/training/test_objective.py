@@ -15,7 +15,7 @@ from nbavatar.errors import ConfigError
 from nbavatar.methods.billboards import training as training
 from nbavatar.methods.billboards.avatar import compose
 from nbavatar.methods.billboards.losses import loss_delta, loss_dice, loss_knn
-from nbavatar.methods.billboards.objective import left_in, step_loss
+from nbavatar.methods.billboards.objective import step_loss
 from nbavatar.methods.create import create_method
 from nbavatar.optimization.schedule import Plan
 from nbavatar.rendering.billboards.functional import render_billboards
@@ -121,25 +121,3 @@ def test_without_any_weight_of_colour_training_is_refused(scene) -> None:
     meshes, _ = read_sequence(scene["meshes"])
     with pytest.raises(ConfigError, match=r"weight_mse.*one above 0"):
         create_method(meshes, {}, [], train_config(weight_mse=0.0, init="random"))
-
-
-def test_dropout_leaves_out_the_asked_share_until_its_end() -> None:
-    count = 10_000
-    for progress, share in ((0.0, 0.4), (0.59, 0.04)):
-        shown = left_in(count, share, 0.6, progress, torch.Generator().manual_seed(1))
-        assert shown is not None and set(shown.unique().tolist()) == {0.0, 1.0}
-        # Four standard deviations of a mean of 10,000 draws.
-        assert abs(float(1.0 - shown.mean()) - share) < 4.0 * (share * (1.0 - share) / count) ** 0.5
-        again = left_in(count, share, 0.6, progress, torch.Generator().manual_seed(1))
-        assert again is not None and torch.equal(shown, again)
-    random = torch.Generator().manual_seed(1)
-    before = random.get_state()
-    assert left_in(count, 0.4, 0.6, 0.6, random) is None and left_in(count, 0.0, 1.0, 0.0, random) is None
-    assert torch.equal(random.get_state(), before)  # without it, all else is drawn as before
-
-
-def test_training_with_dropout_is_deterministic_and_differs(scene, tmp_path) -> None:
-    config = from_mapping(TrainConfig, {**PAPER, **train_options(SMALL)}, "train")
-    dropping = train_config(config, dropout=0.5)
-    runs = [run(scene, cfg, tmp_path / str(i), lpips=distance)[0] for i, cfg in enumerate((dropping, dropping, config))]
-    assert same(runs[0], runs[1]) and not same(runs[0], runs[2])

@@ -135,22 +135,6 @@ def test_a_part_that_is_absent_in_a_frame_leaves_no_trace() -> None:
     assert not torch.equal(render(avatar)[2], render(avatar, lost)[2])
 
 
-def test_a_billboard_that_is_left_out_is_as_if_it_were_not_there() -> None:
-    avatar = make_avatar()
-    shown = torch.cat((torch.ones(8), torch.zeros(4)))  # the head's
-    posed, keep = avatar.pose(VERTS)
-    aside = K.clone()
-    aside[0, 2] -= 0.37  # off the octahedron's plane of symmetry, where faces are equally deep and rounding orders them
-    window = avatar.window(posed, keep, VIEW, aside, 33, 30, roi=False, shown=shown)
-    head, kept = avatar.pose({"head": VERTS["head"]})
-    expected = avatar.window(head, kept, VIEW, aside, 33, 30, roi=False)
-    for a, b in zip(window[:4], expected[:4], strict=True):
-        assert torch.equal(a, b)
-    window.nb_alpha.sum().backward()
-    gradient = avatar.billboards.alpha_logit.grad
-    assert gradient is not None and not gradient[8:].any() and gradient[:8].any()
-
-
 def test_an_avatar_without_any_part_in_a_frame_shows_the_background() -> None:
     image, alpha, nb_alpha = render(make_avatar(deferred=False), {})
     assert nb_alpha.max() == 0 and alpha.max() == 0
