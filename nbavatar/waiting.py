@@ -12,8 +12,9 @@ import os
 
 __all__ = ["SPINS", "VARIABLES", "wait_briefly"]
 
-SPINS = 1000
-"""Turns before a waiting thread sleeps, some 50 microseconds."""
+SPINS = 10_000
+"""Turns before a waiting thread sleeps, some half a millisecond: a tenth of that costs a step on an idle machine 14 % of
+its time, three times as much takes from other programs (docs/benchmarks.md)."""
 
 VARIABLES = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
 """Environment variables by which a user may say it otherwise; `active` or a number of turns."""
