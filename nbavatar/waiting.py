@@ -13,8 +13,8 @@ import os
 __all__ = ["SPINS", "VARIABLES", "wait_briefly"]
 
 SPINS = 10_000
-"""Turns before a waiting thread sleeps, some half a millisecond: a tenth of that costs a step on an idle machine 14 % of
-its time, three times as much takes from other programs (docs/benchmarks.md)."""
+"""Turns before a waiting thread sleeps, some half a millisecond. With a tenth of it a step takes 1.14 of its time on an
+idle machine, with three times as much longer beside other programs (docs/benchmarks.md)."""
 
 VARIABLES = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
 """Environment variables by which a user may say it otherwise; `active` or a number of turns."""
