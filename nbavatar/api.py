@@ -58,13 +58,12 @@ def load_avatar(path: str | os.PathLike[str], device: str = "cpu", *, engine: st
             for the fastest that is installed.
 
     Raises:
-        NBAvatarError: missing, damaged, or not an avatar; an engine that is not there.
+        NBAvatarError: missing, damaged, or not an avatar; an engine that is not there, or named on a GPU.
     """
-    avatar = _load_avatar(path, device)
-    if device == "cpu":
-        from nbavatar.methods.billboards.engine import chosen_engine
+    from nbavatar.methods.billboards.engine import chosen_engine
 
-        avatar.use_engine(chosen_engine(engine))
+    avatar = _load_avatar(path, device)
+    avatar.use_engine(chosen_engine(engine, device))
     return avatar
 
 

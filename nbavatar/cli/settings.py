@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from nbavatar.config.evaluation import AUTO, EAGER, ENGINES
+from nbavatar.config.evaluation import AUTO, ENGINES
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.provenance import file_digest
 
@@ -43,11 +43,7 @@ def take_engine(args: argparse.Namespace, avatar: Any, device: str) -> str:
     """
     from nbavatar.methods.billboards.engine import chosen_engine
 
-    if device != "cpu":
-        if args.engine not in (AUTO, EAGER):
-            raise ConfigError.of("--engine", expected="auto or eager on a GPU", found=args.engine)
-        return EAGER
-    return avatar.use_engine(chosen_engine(args.engine))
+    return avatar.use_engine(chosen_engine(args.engine, device))
 
 
 def timed_device(device: str) -> str:

@@ -38,15 +38,19 @@ def installed_engines() -> list[str]:
     return [name for name in RUNNERS if ready and importlib.util.find_spec(name) is not None]
 
 
-def chosen_engine(name: str) -> str:
-    """The engine behind a name: itself, or for `auto` the fastest that is installed.
+def chosen_engine(name: str, device: str = "cpu") -> str:
+    """The engine behind a name: itself, or for `auto` the fastest that is installed; on a GPU, torch.
 
     Raises:
-        ConfigError: no such engine.
+        ConfigError: no such engine, or one by name on a GPU.
         DependencyError: its package is not installed.
     """
     if name not in ENGINES:
         raise ConfigError.of("--engine", expected=f"one of {', '.join(ENGINES)}", found=name)
+    if device != "cpu":
+        if name not in (AUTO, EAGER):
+            raise ConfigError.of("--engine", expected="auto or eager on a GPU", found=name)
+        return EAGER
     if name == AUTO:
         return next(iter(installed_engines()), EAGER)
     if name != EAGER:
