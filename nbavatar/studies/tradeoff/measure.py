@@ -168,7 +168,7 @@ def measure_point(
         "diff_max": max(row["diff_max"] for row in apart),
         **{name: _mean(apart, name) for name in ("diff_share", "psnr_apart", "lpips_apart")},
         **times,
-        "peak_memory_mb": round(peak_memory_mb(avatar, shots[0], device), 1),
+        "peak_memory_mb": round(peak_memory_mb(avatar, shots[0], device)[0], 1),
         "model_mb": round(avatar_bytes(avatar.avatar) / 1e6, 3),
         "work": work,
     }
@@ -264,8 +264,8 @@ def _timed(avatar: TunedAvatar, shot: Shot, device: str) -> dict[str, float]:
     return spent
 
 
-def peak_memory_mb(avatar: TunedAvatar, shot: Shot, device: str) -> float:
-    """Memory of one picture [MB]: what the avatar keeps, and the most that rendering holds besides.
+def peak_memory_mb(avatar: TunedAvatar, shot: Shot, device: str) -> tuple[float, Tensor]:
+    """Memory of one picture [MB]: what the avatar keeps, and the most that rendering holds besides; and the picture.
 
     On a GPU from its allocator. On Linux from the process's peak resident set, which is reset before; elsewhere it
     cannot be reset, and what the avatar keeps alone is counted.
@@ -275,17 +275,18 @@ def peak_memory_mb(avatar: TunedAvatar, shot: Shot, device: str) -> float:
         torch.cuda.synchronize()
         before = torch.cuda.memory_allocated()
         torch.cuda.reset_peak_memory_stats()
-        shot.render(avatar)
-        return kept + (torch.cuda.max_memory_allocated() - before) / 1e6
+        image = shot.render(avatar)[0]
+        return kept + (torch.cuda.max_memory_allocated() - before) / 1e6, image
     _give_back()
+    counted = True
     try:
         with open("/proc/self/clear_refs", "w") as stream:
             stream.write("5")
         start = _resident("VmRSS")
-        shot.render(avatar)
-        return kept + max(0.0, _resident("VmHWM") - start)
     except OSError:
-        return kept
+        counted, start = False, 0.0
+    image = shot.render(avatar)[0]
+    return kept + (max(0.0, _resident("VmHWM") - start) if counted else 0.0), image
 
 
 def _resident(key: str) -> float:

@@ -20,7 +20,15 @@ from nbavatar.methods.billboards.billboards import Posed
 from nbavatar.methods.billboards.compression.footprint import texels_of
 from nbavatar.methods.billboards.compression.reduce import avatar_bytes, keep_billboards, keep_parts, size_textures
 from nbavatar.metrics.lpips import LPIPS
-from nbavatar.studies.tradeoff.measure import Shot, difference, peak_memory_mb, quality, reference, time_pairs
+from nbavatar.studies.tradeoff.measure import (
+    Reference,
+    Shot,
+    difference,
+    peak_memory_mb,
+    quality,
+    reference,
+    time_pairs,
+)
 from nbavatar.studies.tradeoff.tuned import TunedAvatar
 
 __all__ = ["even_rows", "measure_savings", "savings_markdown", "shrunk", "turned_away"]
@@ -77,19 +85,25 @@ def measure_savings(
         the two, change of PSNR and LPIPS against the truth where there is one (else None), and the work counted, on and
         off.
     """
-    for switch in _switches(avatar, shots, importance, footprints):
+    looks: dict[tuple[int, int], _Look] = {}  # many switches share a side: the exact setting is looked at once
+    for switch in list(_switches(avatar, shots, importance, footprints)):
         times = time_pairs(
             switch.on, switch.off, switch.shots, repeats=sheet.repeats, warmup=sheet.warmup, device=device
         )
-        apart, changes = [], []
-        work = {"on": _counted(switch.on, switch.shots[0]), "off": _counted(switch.off, switch.shots[0])}
-        for shot in switch.shots:
-            on, off = shot.render(switch.on)[0], shot.render(switch.off)[0]
-            apart.append(difference(on, reference(off, net), net))
-            if switch.judged:
-                without, with_it = quality(off, shot, net), quality(on, shot, net)
-                changes.append([(with_it[name] or 0.0) - (without[name] or 0.0) for name in ("psnr", "lpips_net")])
-        memory = [peak_memory_mb(side, switch.shots[0], device) for side in (switch.on, switch.off)]
+        sides = []
+        for side in (switch.on, switch.off):
+            key = id(side), id(switch.shots)
+            if key not in looks:
+                looks[key] = _look(side, switch.shots, net, device, switch.judged)
+            sides.append(looks[key])
+        on, off = sides
+        apart = [difference(*pair, net) for pair in zip(on.images, off.references(net), strict=True)]
+        work = {"on": on.work, "off": off.work}
+        memory = [on.memory_mb, off.memory_mb]
+        changes = [
+            [(with_it[name] or 0.0) - (without[name] or 0.0) for name in ("psnr", "lpips_net")]
+            for with_it, without in zip(on.quality, off.quality, strict=True)
+        ]
         yield {
             "saving": switch.name,
             "scene": switch.scene,
@@ -221,10 +235,26 @@ class _Unaware(TunedAvatar):
         return image, *planes
 
 
-def _counted(avatar: TunedAvatar, shot: Shot) -> dict[str, int]:
-    """Work of one picture."""
+@dataclasses.dataclass
+class _Look:
+    """What one side of a switch shows: pictures (3, H, W), metrics where judged, memory and work of the first."""
+
+    images: list[Tensor]
+    quality: list[dict[str, float | None]]
+    memory_mb: float
+    work: dict[str, int]
+    _references: list[Reference] = dataclasses.field(default_factory=list)
+
+    def references(self, net: LPIPS) -> list[Reference]:
+        if not self._references:
+            self._references = [reference(image, net) for image in self.images]
+        return self._references
+
+
+def _look(avatar: TunedAvatar, shots: Sequence[Shot], net: LPIPS, device: str, judged: bool) -> _Look:
     before = asdict(avatar.work)
-    shot.render(avatar)
-    counted = {name: value - before[name] for name, value in asdict(avatar.work).items()}
-    counted.pop("pictures")
-    return counted
+    memory, first = peak_memory_mb(avatar, shots[0], device)
+    work = {name: value - before[name] for name, value in asdict(avatar.work).items() if name != "pictures"}
+    images = [first, *(shot.render(avatar)[0] for shot in shots[1:])]
+    metrics = [quality(image, shot, net) for image, shot in zip(images, shots, strict=True)] if judged else []
+    return _Look(images, metrics, memory, work)
