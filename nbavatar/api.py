@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from nbavatar.camera.pinhole import Camera
+from nbavatar.camera.pinhole import Camera, facing_pose
 from nbavatar.data.sequences import MeshSequence, read_sequence
 from nbavatar.errors import DataError, NBAvatarError
 from nbavatar.methods.base import MeshAvatar
@@ -101,13 +101,9 @@ def look_at(
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward):
         raise DataError.of("look_at", expected="a target apart from the position, and up across the direction of view",
                            found=f"position {list(position)}, target {list(target)}, up {list(up)}")  # fmt: skip
-    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
-    pose_matrix = np.eye(4)
-    pose_matrix[:3, :3] = np.stack((right, np.cross(forward, right), forward))
-    pose_matrix[:3, 3] = -pose_matrix[:3, :3] @ eye
     focal = 0.5 * height / math.tan(0.5 * fov)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return Camera("look_at", int(width), int(height), K, pose_matrix)
+    return Camera("look_at", int(width), int(height), K, facing_pose(eye, np.asarray(target), np.asarray(up)))
 
 
 def pose(avatar: MeshAvatar, vertices: Vertices, *, frame: str | None = None) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Camera", "crop_intrinsics", "project", "scale_intrinsics"]
+__all__ = ["Camera", "crop_intrinsics", "facing_pose", "project", "scale_intrinsics"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +49,23 @@ def project(points: Any, K: Any, cam_from_world: Any) -> tuple[Any, Any]:
     camera = points @ rotation.swapaxes(-1, -2) + translation
     image = camera @ K.swapaxes(-1, -2)
     return image[..., :2] / image[..., 2:], camera[..., 2]
+
+
+def facing_pose(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """World to camera of a camera that looks at a point, float64 `[4, 4]`.
+
+    Args:
+        position, target: of the camera and of the point, world [m], `[3]`; they differ.
+        up: what is up in the picture, world `[3]`, of any length; not along the direction of view.
+    """
+    forward = np.asarray(target, np.float64) - np.asarray(position, np.float64)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, np.asarray(up, np.float64))
+    right /= np.linalg.norm(right)
+    rotation = np.stack((right, np.cross(forward, right), forward))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ np.asarray(position, np.float64)
+    return pose
 
 
 def crop_intrinsics(K: np.ndarray, x0: float, y0: float) -> np.ndarray:

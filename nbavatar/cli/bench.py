@@ -7,6 +7,7 @@
     nbavatar bench fit       multi-view refit, frames a second and millimetres
     nbavatar bench train     one training step, part by part
     nbavatar bench decoder   the U-Net by torch and by inference engines, in turns
+    nbavatar bench viewer    pictures a second that the viewer draws, by torch and by inference engines, in turns
     nbavatar bench scaling   time and memory against size: exponents and plots
     nbavatar bench waiting   training steps whose threads wait for each other in two ways, in turns
 
@@ -23,7 +24,7 @@ from nbavatar.cli.run import pipeline_folder
 __all__ = ["add_arguments", "main"]
 
 _OF_CAPTURES = ("decoder", "scaling", "waiting")  # measure a capture's training unless another run is named
-_KERNELS = ("raster", "splat", "deform", "spectral", "fit", "train", "decoder", "scaling", "waiting")
+_KERNELS = ("raster", "splat", "deform", "spectral", "fit", "train", "decoder", "viewer", "scaling", "waiting")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
+from nbavatar.camera.pinhole import facing_pose
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
 
@@ -68,14 +69,7 @@ def turntable_views(
         share = number / count
         angle = 2 * math.pi * share if arc >= 2 * math.pi else 0.5 * arc * math.sin(2 * math.pi * share)
         position = centre + _turned(start, up, angle)
-        forward = centre - position
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, up)
-        right /= np.linalg.norm(right)
-        rotation = np.stack((right, np.cross(forward, right), forward))
-        new = np.eye(4)
-        new[:3, :3], new[:3, 3] = rotation, -rotation @ position
-        views.append(_view(manifest, central, sequence.frames[row], row, new))
+        views.append(_view(manifest, central, sequence.frames[row], row, facing_pose(position, centre, up)))
     return views
 
 

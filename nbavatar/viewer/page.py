@@ -15,7 +15,7 @@ import numpy as np
 
 from nbavatar.errors import DataError, NBAvatarError, require
 from nbavatar.viewer.eye import Eye, free_eye, pose_of, view_angle
-from nbavatar.viewer.pictures import SHOWS, Request, draw
+from nbavatar.viewer.pictures import SHOWS, Drawn, Request, draw
 from nbavatar.viewer.scene import EXACT, Scene
 from nbavatar.viewer.worker import RenderWorker, Work
 
@@ -23,7 +23,6 @@ __all__ = ["Viewer"]
 
 _FREE = "free"
 _NOTHING = "nothing"
-_FOV = 0.35  # vertical angle of the first view where there is no camera [rad]
 _MOVED = 1e-2  # a camera of the capture is left when the browser's turns [rad] or moves [radii] by more than this
 _ARRIVAL_S = 3.0  # how long the browser may take to get to a camera of the capture
 _LONG_S = 2.0  # a picture that takes longer is told about while it is drawn
@@ -71,21 +70,10 @@ class Viewer:
         self._worker.stop()
 
     def _first_view(self) -> None:
-        """The view that a tab opens with: from the middle one of the cameras, or along an axis of the world."""
-        first, scene = self.server.initial_camera, self.scene
-        cameras = [scene.camera(name, scene.frames[0]) for name in scene.packs]
-        if cameras:
-            middle = np.sum([pose_of(pose)[1] for _, pose, _, _ in cameras], axis=0)
-            K, pose, width, height = max(cameras, key=lambda camera: float(pose_of(camera[1])[1] @ middle))
-            position, forward, _ = pose_of(pose)
-            distance = max(float((scene.centre - position) @ forward), 0.1)
-            look_at, fov = position + distance * forward, view_angle(K, width, height, 1.5)
-        else:
-            side = np.array([0.0, 0.0, 1.0]) if abs(scene.up[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
-            distance = 1.3 * scene.radius / np.tan(0.5 * _FOV)
-            position, look_at, fov = scene.centre + distance * side, scene.centre, _FOV
-        first.position, first.look_at, first.up = position, look_at, scene.up
-        first.fov, first.near = fov, 0.01
+        """The view that a tab opens with."""
+        first, view = self.server.initial_camera, self.scene.first_view()
+        first.position, first.look_at, first.up = view.position, view.look_at, self.scene.up
+        first.fov, first.near = view.fov, 0.01
 
     def _connected(self, client: Any) -> None:
         self._tabs[client.client_id] = _Tab(self, client)
@@ -112,7 +100,7 @@ class Viewer:
         finally:
             long.cancel()
         spent = time.perf_counter() - began
-        tab.show(drawn.image, drawn.size, spent, work.whole, drawn.remarks)
+        tab.show(drawn, spent, work.whole)
 
     def _failed(self, client: int, error: Exception) -> None:
         tab = self._tabs.get(client)
@@ -180,16 +168,18 @@ class _Tab:
         """Text above the controls."""
         self._status.content = text
 
-    def show(self, image: np.ndarray, size: tuple[int, int], spent: float, whole: bool, remarks: list[str]) -> None:
+    def show(self, drawn: Drawn, spent: float, whole: bool) -> None:
         """Puts a picture on the canvas, and how it was made above the controls."""
         if self._closed.is_set():
             return
-        self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=90 if whole else 70)
+        self._client.scene.set_background_image(drawn.image, format="jpeg", jpeg_quality=90 if whole else 70)
         state = "" if whole else " while moving"
         rate = 1.0 / max(spent, 1e-6)
-        line = f"**{size[0]} x {size[1]} px**{state}, **{1000 * spent:.0f} ms**, {rate:.1f} pictures a second"
+        width, height = drawn.size
+        line = f"**{width} x {height} px**{state}, **{1000 * spent:.0f} ms**, {rate:.1f} pictures a second"
+        decoder = [f"decoded by {' and '.join(drawn.decoders)}"] if drawn.decoders else []
         frame = f"frame {self._viewer.scene.frames[self._row()]}"
-        self.say("  \n".join([line, frame, *remarks]))
+        self.say("  \n".join([line, *decoder, frame, *drawn.remarks]))
 
     def _row(self) -> int:
         return min(int(self._frame.value), len(self._viewer.scene.frames) - 1)

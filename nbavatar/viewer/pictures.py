@@ -51,32 +51,49 @@ class Request:
 
 
 class Drawn(NamedTuple):
-    """A picture uint8 (H, W, 3) of the canvas's shape, the size [px] that was rendered, and remarks on it."""
+    """A picture.
+
+    Attributes:
+        image: uint8 (H, W, 3), of the canvas's shape.
+        size: width and height [px] that were rendered.
+        remarks: on it.
+        decoders: what ran the avatars' U-Nets, with the version; empty where no U-Net was run.
+    """
 
     image: np.ndarray
     size: tuple[int, int]
     remarks: list[str]
+    decoders: list[str]
+
+
+class _View(NamedTuple):
+    """One avatar's picture, float32 (H, W, 3) in [0, 1], remarks on it, and what ran its U-Net, if anything did."""
+
+    image: np.ndarray
+    remarks: list[str]
+    decoder: str
 
 
 def draw(scene: Scene, request: Request, side: int) -> Drawn:
     """One picture with a longer side of `side` pixels, or of the camera's own size where the error is shown."""
     if request.show == "error" and request.eye.camera:
         side = min(side, max(request.eye.width, request.eye.height))
-    eye, remarks = request.eye.scaled(side), []
-    image, said = _view(scene, scene.entries[request.first], request, eye)
-    remarks += said
+    eye = request.eye.scaled(side)
+    views = [_view(scene, scene.entries[name], request, eye) for name in (request.first, request.second) if name]
+    image, remarks = views[0].image, [remark for view in views for remark in view.remarks]
     if request.second:
-        other, said = _view(scene, scene.entries[request.second], request, eye)
         border = round(request.wipe * eye.width)
-        image = np.concatenate((image[:, :border], other[:, border:]), axis=1)
+        image = np.concatenate((image[:, :border], views[1].image[:, border:]), axis=1)
         image[:, max(0, border - 1) : border + 1] = (0.9, 0.3, 0.1)
-        remarks = [f"left {request.first}, right {request.second}", *remarks, *said]
+        remarks = [f"left {request.first}, right {request.second}", *remarks]
     pixels = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-    return Drawn(_on_canvas(pixels, eye.aspect), (eye.width, eye.height), list(dict.fromkeys(remarks)))
+    decoders = [view.decoder for view in views if view.decoder]
+    canvas, size = _on_canvas(pixels, eye.aspect), (eye.width, eye.height)
+    return Drawn(canvas, size, list(dict.fromkeys(remarks)), list(dict.fromkeys(decoders)))
 
 
-def _view(scene: Scene, entry: Entry, request: Request, eye: Eye) -> tuple[np.ndarray, list[str]]:
-    """One avatar, float32 (H, W, 3) in [0, 1], and remarks."""
+def _view(scene: Scene, entry: Entry, request: Request, eye: Eye) -> _View:
+    """One avatar."""
     background = torch.tensor(request.background, dtype=torch.float32, device=scene.device)
     verts, frame = entry.vertices(request.frame, scene.device)
     viewmat = torch.tensor(eye.cam_from_world, dtype=torch.float32, device=scene.device)
@@ -84,28 +101,44 @@ def _view(scene: Scene, entry: Entry, request: Request, eye: Eye) -> tuple[np.nd
     place = viewmat, K, eye.width, eye.height
     with torch.no_grad():
         if request.show == "billboards":
-            return _pixels(_primitives(entry.avatar, verts, frame, *place, background)), []
+            return _View(_pixels(_primitives(entry.avatar, verts, frame, *place, background)), [], "")
         if request.show == "features":
             features = _features(entry.avatar, verts, frame, *place)
             if features is not None:
-                return _pixels(features), []
+                return _View(_pixels(features), [], "")
             remark = [f"{entry.name} has no features: its render"]
         else:
             remark = []
         avatar = entry.under(request.preset)
         if request.preset != EXACT and request.preset not in entry.presets:
             remark = [*remark, f"{entry.name} has no preset {request.preset}: the exact setting"]
+        before = _decoded(entry.avatar)
         image, alpha, _ = avatar.render(verts, *place, background, frame=frame)
+    decoder = _decoder(entry.avatar, before)
     if request.show == "alpha":
-        return _pixels(alpha.expand(3, -1, -1)), remark
+        return _View(_pixels(alpha.expand(3, -1, -1)), remark, decoder)
     picture = _pixels(image)
     if request.show == "wireframe":
-        return _edges(picture, entry.avatar, verts, eye), remark
-    if not eye.camera:
-        return picture, [*remark, "choose a camera to see the error"] if request.show == "error" else remark
-    if max(eye.width, eye.height) > max(request.eye.width, request.eye.height):  # there is no truth of this size
-        return picture, remark
-    return _judged(scene, entry, request, eye, picture, remark)
+        picture = _edges(picture, entry.avatar, verts, eye)
+    elif not eye.camera:
+        remark = [*remark, "choose a camera to see the error"] if request.show == "error" else remark
+    elif max(eye.width, eye.height) <= max(request.eye.width, request.eye.height):  # else no truth of this size
+        picture, remark = _judged(scene, entry, request, eye, picture, remark)
+    return _View(picture, remark, decoder)
+
+
+def _decoded(avatar: Any) -> int:
+    """How many pictures the avatar's engine has decoded."""
+    return avatar.engine.decoded if isinstance(avatar, Avatar) and avatar.engine is not None else 0
+
+
+def _decoder(avatar: Any, before: int) -> str:
+    """What has run the avatar's U-Net since the engine had decoded this many: the engine, else torch."""
+    if not isinstance(avatar, Avatar) or avatar.unet is None:
+        return ""
+    if avatar.engine is not None and avatar.engine.decoded > before:
+        return avatar.engine.name
+    return f"torch {torch.__version__}"
 
 
 def _judged(

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -11,11 +11,22 @@ from nbavatar.data.sequences import MeshSequence
 from nbavatar.evaluation.orbit import focus
 from nbavatar.evaluation.render import check_parts, posed_vertices
 from nbavatar.io.framepack import FramePack
+from nbavatar.viewer.eye import pose_of, view_angle
 
-__all__ = ["EXACT", "Entry", "Scene"]
+__all__ = ["EXACT", "Entry", "FirstView", "Scene"]
 
 EXACT = "exact"
 """Name of the setting in which nothing is left out."""
+_FOV = 0.35  # vertical angle of the first view where there is no camera [rad]
+
+
+class FirstView(NamedTuple):
+    """Where one looks from at first: the camera's place and the point that it looks at, world (3,) [m]; its vertical
+    angle of view [rad]."""
+
+    position: np.ndarray
+    look_at: np.ndarray
+    fov: float
 
 
 class Entry:
@@ -108,6 +119,23 @@ class Scene:
             except ValueError:
                 continue
         return np.zeros(3)
+
+    def first_view(self, aspect: float = 1.5) -> FirstView:
+        """The view from the middle one of the cameras, or along an axis of the world where there is none.
+
+        Args:
+            aspect: width to height of the canvas that the camera's picture has to fit into.
+        """
+        cameras = [self.camera(name, self.frames[0]) for name in self.packs]
+        if cameras:
+            middle = np.sum([pose_of(pose)[1] for _, pose, _, _ in cameras], axis=0)
+            K, pose, width, height = max(cameras, key=lambda camera: float(pose_of(camera[1])[1] @ middle))
+            position, forward, _ = pose_of(pose)
+            distance = max(float((self.centre - position) @ forward), 0.1)
+            return FirstView(position, position + distance * forward, view_angle(K, width, height, aspect))
+        side = np.array([0.0, 0.0, 1.0]) if abs(self.up[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+        distance = 1.3 * self.radius / np.tan(0.5 * _FOV)
+        return FirstView(self.centre + distance * side, self.centre, _FOV)
 
     def truth(self, camera: str, frame: str, background: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """What a camera recorded, on a background.

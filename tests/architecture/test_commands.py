@@ -42,6 +42,7 @@ RUN = {
     "nbavatar view": ("tests/unit/viewer/test_page.py", '"view"'),
     "nbavatar bench raster --json": ("tests/architecture/test_commands.py", "test_benchmarks_at_a_small_size"),
     "nbavatar bench raster --orders": ("tests/architecture/test_commands.py", "test_benchmarks_at_a_small_size"),
+    "nbavatar bench viewer": ("tests/unit/studies/benchmarks/test_viewer.py", '"viewer"'),
     "python examples/render_avatar.py": ("tests/unit/test_api.py", "render_avatar.py"),
     "python -m pytest tests/unit/rendering/billboards/test_cuda_simulator.py": (".ci/run", "make test"),
     "snakemake --configfile config/smoke.yaml -n": ("tests/architecture/test_commands.py", "test_help_and_plans"),

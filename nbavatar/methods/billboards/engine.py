@@ -64,12 +64,14 @@ class DecoderEngine:
 
     Attributes:
         name: of the package with its version, such as `openvino 2026.4.1`, for records.
+        decoded: pictures so far.
     """
 
     def __init__(self, kind: str) -> None:
         """Args: kind: `openvino` or `onnxruntime`."""
         self._make = {"openvino": _openvino, "onnxruntime": _onnxruntime}[kind]
         self.name = f"{kind} {metadata.version(kind)}"
+        self.decoded = 0
         self._weights: list[tuple[int, int]] = []
         self._run: _Run | None = None
 
@@ -91,6 +93,7 @@ class DecoderEngine:
         if self._run is None or weights != self._weights:
             self._run, self._weights = self._make(unet_graph(unet), torch.get_num_threads()), weights
         colour, opacity = self._run(features.contiguous().numpy())
+        self.decoded += 1
         return torch.from_numpy(colour), torch.from_numpy(opacity)
 
 

@@ -27,6 +27,7 @@ from nbavatar.methods.billboards.engine import RUNNERS, DecoderEngine, installed
 from nbavatar.methods.billboards.options import UNetConfig
 from nbavatar.methods.billboards.unet import FORMS, UNet, macs
 from nbavatar.studies.benchmarks.step_scene import training_options
+from nbavatar.studies.benchmarks.turns import in_turns, median_ratio
 
 __all__ = ["add_arguments", "run"]
 
@@ -80,25 +81,17 @@ def _turns(unet: UNet, engines: dict[str, DecoderEngine], side: int, repeats: in
     """Figures of one size."""
     features = torch.randn(1, unet.stem[0].weight.shape[1], side, side)
     features = features.contiguous(memory_format=torch.channels_last)
-    calls: dict[str, Callable[[], tuple[Tensor, Tensor]]] = {"eager": lambda: unet(features)}
-    calls |= {kind: lambda own=engine: own(unet, features) for kind, engine in engines.items()}
-    wall: dict[str, list[float]] = {kind: [] for kind in calls}
-    spent: dict[str, list[float]] = {kind: [] for kind in calls}
+    calls: dict[str, Callable[[int], tuple[Tensor, Tensor]]] = {"eager": lambda _: unet(features)}
+    calls |= {kind: lambda _, own=engine: own(unet, features) for kind, engine in engines.items()}
     figures = {}
     with torch.inference_mode():
-        found = {kind: call() for kind, call in calls.items()}  # prepares them, too
-        for _ in range(repeats):
-            for kind, call in calls.items():
-                began, used = time.perf_counter(), time.process_time()
-                call()
-                wall[kind].append(1e3 * (time.perf_counter() - began))
-                spent[kind].append(1e3 * (time.process_time() - used))
+        found = {kind: call(0) for kind, call in calls.items()}  # prepares them, too
+        turns = in_turns(calls, repeats)
     for kind in calls:
-        figures[f"{kind}_ms"] = statistics.median(wall[kind])
-        figures[f"{kind}_cpu_ms"] = statistics.median(spent[kind])
+        figures[f"{kind}_ms"] = statistics.median(turns.wall[kind])
+        figures[f"{kind}_cpu_ms"] = statistics.median(turns.spent[kind])
     for kind in engines:
-        turns = zip(spent["eager"], spent[kind], strict=True)
-        figures[f"{kind}_ratio"] = statistics.median(eager / own for eager, own in turns)
+        figures[f"{kind}_ratio"] = median_ratio(turns.spent["eager"], turns.spent[kind])
         pairs = zip(found["eager"], found[kind], strict=True)
         figures[f"{kind}_error"] = max(float((a - b).abs().amax()) for a, b in pairs)
     return figures

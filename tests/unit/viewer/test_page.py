@@ -38,6 +38,8 @@ def viewer(tmp_path):
     for path in scene["packs"]:
         (run / "crop" / "center" / "toy" / path.name).write_bytes(path.read_bytes())
     save_avatar(run / "train" / "toy" / "full" / "model.pt", make_avatar(deferred=False))
+    (run / "train" / "toy" / "with_unet").mkdir()
+    save_avatar(run / "train" / "toy" / "with_unet" / "model.pt", make_avatar())
     parser = view.argparse.ArgumentParser()
     view.add_arguments(parser)
     opened = view.open_scene(parser.parse_args([str(run)]), "cpu")
@@ -88,6 +90,12 @@ def test_the_page_turns_and_plays(viewer, browser) -> None:
         browser.press("ArrowRight", 39)
     browser.wait(lambda: "frame f3" in browser.text(), "the last frame")
     changed(browser, turned, "another picture in another frame")
+    assert "decoded by" not in browser.text(), "there is no U-Net"
+    (tab,) = viewer._tabs.values()
+    tab._first.value = "with_unet"
+    engine = viewer.scene.entries["with_unet"].avatar.engine
+    name = "torch" if engine is None else engine.name
+    browser.wait(lambda: f"decoded by {name}" in browser.text(), "the name of what decodes")
     assert browser.console == []
 
 

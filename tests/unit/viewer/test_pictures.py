@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from nbavatar.camera.pinhole import project
+from nbavatar.camera.pinhole import facing_pose, project
 from nbavatar.data.sequences import read_sequence
 from nbavatar.io.framepack import FramePack
 from nbavatar.math.rotations import matrix_to_quaternion
+from nbavatar.methods.billboards.engine import installed_engines
 from nbavatar.viewer.eye import Eye, free_eye, pose_of, view_angle
 from nbavatar.viewer.pictures import SHOWS, Request, draw
 from nbavatar.viewer.scene import Entry, Scene
@@ -84,6 +85,33 @@ def test_every_picture_fits_the_canvas_and_shows_the_avatar(scene) -> None:
         assert (middle != middle[0, 0]).any(-1).mean() > 0.05, show
     without = draw(scene, Request(eye_of(scene), "f0", "no_dnr", show="features"), SIZE)
     assert without.remarks[0] == "no_dnr has no features: its render"
+
+
+@pytest.mark.parametrize("kind", ["eager", *installed_engines()])
+def test_a_picture_names_what_decoded_it(scene, kind: str) -> None:
+    name = scene.entries["full"].avatar.use_engine(kind)
+    decoder = f"torch {torch.__version__}" if kind == "eager" else name
+    for show, second, decoders in (
+        ("render", "", [decoder]), ("alpha", "no_dnr", [decoder]), ("billboards", "", []), ("features", "", []),
+    ):  # fmt: skip
+        assert draw(scene, Request(eye_of(scene), "f1", "full", second, show=show), SIZE).decoders == decoders
+    assert draw(scene, Request(eye_of(scene), "f1", "no_dnr"), SIZE).decoders == []
+    # Too small for an engine: one row of pixels at the deepest level.
+    small = draw(scene, Request(eye_of(scene), "f1", "full"), 8).decoders
+    assert small == [f"torch {torch.__version__}"]
+
+
+def test_the_first_view_is_the_middle_cameras_and_shows_the_avatar_without_cameras(scene) -> None:
+    view, pose = scene.first_view(), camera(1)
+    np.testing.assert_allclose(facing_pose(view.position, view.look_at, scene.up), pose, atol=1e-12)
+    alone = Scene(list(scene.entries.values()), {})
+    view = alone.first_view()
+    points = np.concatenate([part.verts[0] for part in alone.entries["full"].sequence.parts.values()])
+    focal = 0.5 / np.tan(0.5 * view.fov)
+    K = np.array([[focal, 0, 0.5], [0, focal, 0.5], [0, 0, 1]])
+    pixels, depth = project(points, K, facing_pose(view.position, view.look_at, alone.up))
+    head = pixels[:6]
+    assert (depth > 0).all() and 0 < head.min() and head.max() < 1 and np.ptp(head[:, 1]) > 0.5
 
 
 def test_the_browsers_camera_is_a_pinhole_of_the_conventions() -> None:

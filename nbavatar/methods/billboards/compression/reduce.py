@@ -86,7 +86,7 @@ def avatar_bytes(avatar: Avatar) -> int:
 def _rebuilt(
     avatar: Avatar, faces: dict[str, Tensor], billboards: Billboards, places: Sequence[Tensor], texels: int
 ) -> Avatar:
-    """An avatar of these billboards, placed by mu, quat and log_scale, with the renderer and refinement of another."""
+    """These billboards, placed by mu, quat and log_scale, with renderer, engine and refinement of the avatar."""
     with torch.no_grad():
         for mine, value in zip((billboards.mu, billboards.quat, billboards.log_scale), places, strict=True):
             mine.copy_(value)
@@ -95,7 +95,7 @@ def _rebuilt(
     plain = dataclasses.replace(architecture, deferred=False)
     counts = {part: avatar.vertex_counts[part] for part in faces}
     result = Avatar(plain, faces, counts, billboards, refinement=avatar.refinement, record=avatar.record)
-    result.architecture, result.unet = architecture, avatar.unet
+    result.architecture, result.unet, result.engine = architecture, avatar.unet, avatar.engine
     return result.to(avatar.faces.device).eval()
 
 

@@ -9,9 +9,10 @@ import torch
 from nbavatar.config.evaluation import AUTO, EAGER
 from nbavatar.errors import ConfigError, DependencyError
 from nbavatar.methods.billboards import engine
+from nbavatar.methods.billboards.compression.reduce import keep_parts
 from nbavatar.methods.billboards.engine import RUNNERS, DecoderEngine, chosen_engine, installed_engines
 from nbavatar.methods.billboards.unet import FORMS, UNet
-from tests.unit.methods.billboards.test_model import make_avatar
+from tests.unit.methods.billboards.test_model import make_avatar, render
 
 # `make install` brings all engines, so these run in CI; only an environment without the extra `engine` lacks some.
 _ABSENT = pytest.mark.skip("an optional engine that is not installed: pip install 'nbavatar[engine,export]'")
@@ -92,6 +93,14 @@ def test_avatars_use_an_engine_in_float32_only_and_say_which() -> None:
     avatar.decode(features, alpha)
     assert len(calls) == 1
     assert make_avatar(deferred=False).use_engine(AUTO) == EAGER
+
+
+@pytest.mark.parametrize("kind", INSTALLED[-1:])
+def test_a_smaller_avatar_made_of_one_is_decoded_by_its_engine(kind: str) -> None:
+    avatar = make_avatar()
+    avatar.use_engine(kind)
+    render(keep_parts(avatar, ["head"]))
+    assert avatar.engine.decoded == 1
 
 
 def test_the_best_that_is_installed_is_chosen_and_what_is_not_is_refused(monkeypatch) -> None:
