@@ -1,28 +1,35 @@
 """Makes the pictures of README.md and docs/: a synthetic person is filmed, an avatar trained, and drawn.
 
-    tools/pictures.py [--results results/pictures] [--capture resources/pictures] [--out docs/pictures] [--cores N]
+    python -m tools.pictures [--results results/pictures] [--capture resources/pictures] [--out docs/pictures]
+                             [--only strip film viewer] [--cores N]
 
 `make pictures` runs it. The avatar is that of config/capture.yaml with the changes of tools/pictures.yaml; its training
-takes most of an hour on one core, and what is done already is not done again. Everything is shown from a camera, or a
-place, that no training saw.
+takes most of an hour on one core, and what is done already is not done again. With other --results, only their avatar
+is drawn. Everything is shown from a camera, or a place, that no training saw. The viewer is photographed in headless
+Chromium (Debian: apt-get install chromium); without one its picture stays as it is.
 """
 
 import argparse
+import io
 import math
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from nbavatar.cli.view import open_scene
+from nbavatar.config.evaluation import AUTO, EAGER
 from nbavatar.evaluation.orbit import turntable_views
 from nbavatar.provenance import file_digest
 from nbavatar.reporting.insets import contact_pixels
 from nbavatar.viewer.eye import Eye
+from nbavatar.viewer.page import Viewer
 from nbavatar.viewer.pictures import Request, draw
 from nbavatar.viewer.scene import Scene
+from tests.browser import Browser, find_browser
 
 FILMED = '{"layout": "capture", "subjects": ["S2"], "width": 320, "height": 320, "focal": 3.3, "frames": 48}'
 SIDE = 256  # of one picture [px]
@@ -31,6 +38,8 @@ LINE = 26  # height of a line of text [px]
 FPS = 12
 SWING = math.radians(100)  # how far the free camera goes from side to side
 BUDGET = 1.5e6  # bytes: of everything together
+WINDOW = 1100, 640  # of the browser [px]
+PICTURES = ("strip", "film", "viewer")
 
 
 def main() -> int:
@@ -39,19 +48,27 @@ def main() -> int:
     parser.add_argument("--results", type=Path, default=Path("results/pictures"))
     parser.add_argument("--capture", type=Path, default=Path("resources/pictures"))
     parser.add_argument("--out", type=Path, default=Path("docs/pictures"))
+    parser.add_argument("--only", nargs="+", default=PICTURES, choices=PICTURES)
     parser.add_argument("--cores", default="1")
     args = parser.parse_args()
     if args.results == Path("results/pictures"):
         train(args.capture, args.cores)
-    scene = open_scene(argparse.Namespace(path=[str(args.results)], meshes=None, cameras=[], subject=None), "cpu")
+    scene = opened(args.results, EAGER)
     camera = held_out(scene)
     args.out.mkdir(parents=True, exist_ok=True)
-    strip(scene, camera).save(args.out / "avatar.webp", quality=88, method=6)
-    films = film(scene, camera)
-    films[0].save(
-        args.out / "avatar-moves.webp", save_all=True, append_images=films[1:], duration=round(1000 / FPS), loop=0,
-        quality=72, method=6,
-    )  # fmt: skip
+    if "strip" in args.only:
+        strip(scene, camera).save(args.out / "avatar.webp", quality=88, method=6)
+    if "film" in args.only:
+        films = film(scene, camera)
+        films[0].save(
+            args.out / "avatar-moves.webp", save_all=True, append_images=films[1:], duration=round(1000 / FPS), loop=0,
+            quality=72, method=6,
+        )  # fmt: skip
+    program = find_browser()
+    if "viewer" in args.only and program is None:
+        print(f"no Chromium found: {args.out / 'viewer.webp'} stays as it is", file=sys.stderr)
+    elif "viewer" in args.only:
+        page(opened(args.results, AUTO), camera, program).save(args.out / "viewer.webp", quality=85, method=6)
     sizes = {path.name: path.stat().st_size for path in sorted(args.out.iterdir())}
     print("\n".join(f"{args.out / name}: {size / 1e3:.0f} kB" for name, size in sizes.items()))
     if sum(sizes.values()) > BUDGET:
@@ -67,6 +84,12 @@ def train(capture: Path, cores: str) -> None:
         subprocess.run([*ours, "synthesize", "--out", str(capture), "--cfg", FILMED], check=True)
     wanted = ["results/pictures/train/S2/full/model.pt", "--configfile", "config/capture.yaml", "tools/pictures.yaml"]
     subprocess.run([*ours, "run", "capture", str(capture / "S2"), "--cores", cores, "--", *wanted], check=True)
+
+
+def opened(results: Path, engine: str) -> Scene:
+    """A run's avatars, decoded by an engine (`nbavatar.config.evaluation.ENGINES`)."""
+    words = argparse.Namespace(path=[str(results)], meshes=None, cameras=[], subject=None, engine=engine)
+    return open_scene(words, "cpu")
 
 
 def held_out(scene: Scene) -> str:
@@ -144,6 +167,27 @@ def film(scene: Scene, camera: str) -> list[Image.Image]:
             )
         )
     return pictures
+
+
+def page(scene: Scene, camera: str, program: str) -> Image.Image:
+    """The viewer in a browser, at the frame of the contact, turned a little."""
+    viewer = Viewer(scene, host="127.0.0.1", port=8790, side=512, title="nbavatar")
+    with tempfile.TemporaryDirectory() as profile:
+        browser = Browser(program, Path(profile), WINDOW)
+        try:
+            browser.open(viewer.address)
+            browser.wait(lambda: " ms" in browser.text(), "the first picture")
+            browser.evaluate("document.querySelector('[role=slider]').focus()")
+            for _ in range(scene.frames.index(contact_frame(scene, camera))):
+                browser.press("ArrowRight", 39)
+            browser.evaluate("document.activeElement.blur()")
+            browser.drag((300, 350), (340, 345))
+            browser.wait(lambda: f"frame {contact_frame(scene, camera)}" in browser.text(), "the frame of the contact")
+            browser.wait(lambda: "while moving" not in browser.text(), "a whole picture at rest")
+            return Image.open(io.BytesIO(browser.screenshot())).convert("RGB")
+        finally:
+            browser.close()
+            viewer.stop()
 
 
 if __name__ == "__main__":

@@ -4,8 +4,6 @@ import csv
 import json
 import math
 import os
-import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -113,15 +111,3 @@ def test_report_is_one_file_that_needs_no_network():
     for word in ('src="http', "src='http", 'href="http://', "@import", "fetch("):
         assert word not in page
     assert "<img" in page and "data:image/" in page
-
-
-def test_the_tutorial_trains_by_hand(tmp_path):
-    """Its command as it stands, but for two steps and a folder of the test's own."""
-    text = (ROOT / "docs/tutorial.md").read_text(encoding="utf-8").replace("\\\n", " ")
-    (command,) = re.findall(r"^\.venv/bin/nbavatar (train +--frames .*)$", text, flags=re.MULTILINE)
-    words = command.replace("/tmp/model.pt", shlex.quote(str(tmp_path / "model.pt"))) + " --set steps=2"
-    done = subprocess.run(
-        f"{shlex.quote(sys.executable)} -m nbavatar {words}", shell=True, cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert (tmp_path / "model.pt").stat().st_size > 1000
