@@ -5,6 +5,8 @@
                 split is "train" are used
     --meshes    mesh sequence (.npz): faces, rest pose and posed vertices per part [m], world, one row a frame
     --spectral  spectral coordinates (.npz): `<part>.coords` float32 [V, K]
+    --start     model.pt of an earlier training or of another subject; what fits of it is taken over, part by part, and
+                a line says what does not
     --out       model.pt, one file; opens with torch.load(weights_only=True)
 
 Beside the model, `<out>.state/` holds the last checkpoint, events.jsonl (losses, PSNR on the training views, speed),
@@ -41,6 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spectral", metavar="NPZ", help="spectral coordinates; needed for init=spectral and refinement"
     )
+    parser.add_argument(
+        "--start", nargs="?", const="", metavar="PT",
+        help="avatar to start from, in place of the option `start`; with nothing after it, none",
+    )  # fmt: skip
     parser.add_argument("--out", required=True, metavar="PT", help="model file to write")
     parser.add_argument("--history", metavar="JSONL", help="copy of the events to write when training is done")
     parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help="where to compute")
@@ -57,15 +63,22 @@ def main(args: argparse.Namespace) -> int:
         config = _with_preset(args.preset, args.presets, config)
     if args.max_minutes is not None:
         config = replace(config, max_minutes=args.max_minutes)
+    if args.start is not None:
+        config = replace(config, start=args.start)
     if config.wandb:
         check_name(config.wandb, "option", "wandb", error=ConfigError)
         require("wandb", "wandb", "the option `wandb`")  # before anything is read or trained
     inputs = {f"frames.{i}": path for i, path in enumerate(args.frames)} | {"meshes": args.meshes}
     if args.spectral:
         inputs["spectral"] = args.spectral
+    if config.start:
+        inputs["start"] = config.start
     for name, path in inputs.items():
         if not Path(path).is_file():
             raise DataError.of(path, expected=f"a file (--{name.partition('.')[0]})", found="no such file")
+    if config.start and Path(args.out).is_file() and Path(args.out).samefile(config.start):
+        fix = "name another file: this one would be replaced"
+        raise ConfigError.of(args.out, "--out", expected="a file to write", found="the option start", fix=fix)
     with lease_device(args.device) as device:
         if device == "cuda":
             from nbavatar.cli.gpu_verdict import require_right_gpu  # provenance: neutral, it only looks
@@ -120,7 +133,8 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     from nbavatar.data.views import ViewStore, check_views, views_of
     from nbavatar.io.framepack import FramePack
     from nbavatar.methods.create import create_method
-    from nbavatar.methods.storage import save_avatar
+    from nbavatar.methods.start import start_from
+    from nbavatar.methods.storage import load_avatar, save_avatar
     from nbavatar.training.loop import train
     from nbavatar.training.state import RunFolder
 
@@ -136,14 +150,23 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
         from nbavatar.metrics.lpips import load_lpips
 
         lpips = load_lpips(net).to(device)
+    taken = None
+    if config.start:
+        # Where a training goes on, its state takes the place of all of this; the record says it all the same.
+        taken = start_from(method, load_avatar(config.start, device), config.start)
+        record["start"] = taken._asdict()
     key = {name: record[name] for name in ("code", "inputs")}
-    key["config"] = {name: value for name, value in record["config"].items() if name != "wandb"}  # changes no result
+    # These change no result: of a start, its digest is among the inputs.
+    key["config"] = {name: value for name, value in record["config"].items() if name not in ("wandb", "start")}
     with RunFolder(f"{args.out}.state", key, wandb=config.wandb) as folder:
         if folder.moved_to is not None:
             print(
                 f"an earlier state belongs to other inputs, options or code; moved to {folder.moved_to}",
                 file=sys.stderr,
             )
+        if taken is not None and not folder.begun:
+            left = f"; not {', '.join(taken.left)}" if taken.left else ""
+            print(f"{config.start}: took over {', '.join(taken.over)}{left}", file=sys.stderr)
         bar, stop = _Bar(Path(args.out).name), _TerminationFlag()
         meshes = {part: torch.from_numpy(sequence.parts[part].verts) for part in avatar.parts}
         summary = train(

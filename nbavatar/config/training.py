@@ -21,6 +21,11 @@ class _Shared:
 
     method: str = option("billboards", "The method that is trained.", choices=tuple(METHODS))
     parts: list[str] | None = option(None, "Parts to model; all that the meshes have by default.", choices=_PARTS)
+    start: str = option(
+        "",
+        "Another avatar of the same method (model.pt), whose values are taken over where they fit; empty for none. In "
+        "a run also `subject/variant` of the same run.",
+    )
     schedule: str = option(
         "fast", "fast: coarse to fine with a final decay; paper: 400,000 plain steps.", choices=("fast", "paper")
     )

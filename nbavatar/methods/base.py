@@ -22,7 +22,7 @@ from nbavatar.errors import ConfigError, DataError
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import Plan, plan_at, total_steps
 
-__all__ = ["MeshAvatar", "Method", "Stages", "StepLoss", "compose", "modelled_parts"]
+__all__ = ["MeshAvatar", "Method", "Stages", "StepLoss", "Taken", "compose", "modelled_parts"]
 
 
 class Stages(NamedTuple):
@@ -90,13 +90,20 @@ class MeshAvatar(nn.Module, ABC):
         counts = torch.tensor([self.face_counts[part] for part in self.parts])
         return torch.repeat_interleave(torch.arange(len(self.parts)), counts)
 
+    def face_ranges(self) -> dict[str, slice]:
+        """Where the faces of each part lie in `faces`."""
+        ranges, first = {}, 0
+        for part in self.parts:
+            ranges[part] = slice(first, first + self.face_counts[part])
+            first += self.face_counts[part]
+        return ranges
+
     def part_faces(self) -> dict[str, Tensor]:
         """Faces of each part in its own vertex numbers, int64 (F, 3), on the CPU."""
-        faces, first, offset = {}, 0, 0
-        for part in self.parts:
-            last = first + self.face_counts[part]
-            faces[part] = (self.faces[first:last] - offset).cpu()
-            first, offset = last, offset + self.vertex_counts[part]
+        faces, offset = {}, 0
+        for part, rows in self.face_ranges().items():
+            faces[part] = (self.faces[rows] - offset).cpu()
+            offset += self.vertex_counts[part]
         return faces
 
     def merged(
@@ -227,6 +234,18 @@ class MeshAvatar(nn.Module, ABC):
         self.load_state_dict(dict(state))
 
 
+class Taken(NamedTuple):
+    """What an avatar took over from another one, in words.
+
+    Attributes:
+        over: what has the other's values.
+        left: what has not, each with the reason in brackets: it starts as without, or is left out.
+    """
+
+    over: list[str]
+    left: list[str]
+
+
 class StepLoss(NamedTuple):
     """Loss of one step.
 
@@ -274,6 +293,21 @@ class Method(ABC):
             config: training options.
             device: where to compute.
         """
+
+    def take_over(self, other: MeshAvatar, parts: Sequence[str]) -> Taken:
+        """Values of another avatar in place of the initial ones, before the first step and before Adam is made.
+
+        Args:
+            other: of the same method, on the same device.
+            parts: those whose faces are the same in both, one at least.
+
+        Returns:
+            what was taken over of these parts and besides, and what could not be.
+
+        Raises:
+            ConfigError: the method cannot.
+        """
+        raise ConfigError.of("start", expected="none for this method", found="an avatar")
 
     def lpips_net(self) -> str | None:
         """Backbone of the LPIPS that the loss needs, or None."""

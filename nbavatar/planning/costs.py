@@ -159,7 +159,7 @@ def workload(plan: Plan, frames: int, sheet: TradeoffConfig) -> list[Work]:
     for _ in run.reenact:
         add("reenact", "", "frames", frames)
         add("reenact_contact", "", "frames", frames)
-    for avatar in units.avatars(plan):
+    for avatar in (*units.avatars(plan), *units.starts(plan)):
         add("train", avatar.variant, "steps", training_steps(plan, avatar.variant))
     for row in plan.rows:
         novel = plan.holds_out_view(row.protocol)

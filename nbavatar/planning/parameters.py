@@ -3,17 +3,34 @@
 import json
 
 from nbavatar.config.core import to_mapping
+from nbavatar.config.inputs import given_digest
 from nbavatar.config.run import stage_options
 from nbavatar.planning.figures import shown
 from nbavatar.planning.run import Plan
+from nbavatar.planning.units import start_of
 from nbavatar.provenance import code_digest
 
-__all__ = ["avatar_code", "comparison_text", "crop_text", "figure_code", "method_of", "protocol_text", "stage_text"]
+__all__ = [
+    "avatar_code",
+    "comparison_text",
+    "crop_text",
+    "figure_code",
+    "method_of",
+    "protocol_text",
+    "stage_text",
+    "start_digest",
+]
 
 
 def stage_text(plan: Plan, stage: str, variant: str | None = None) -> str:
     """The resolved options of a stage, as sorted JSON: spelling out a default changes nothing."""
     return json.dumps(stage_options(plan.run, stage, variant), sort_keys=True)
+
+
+def start_digest(plan: Plan, subject: str, variant: str) -> str:
+    """Digest of the file that the user gave for a training to start from; empty where there is none."""
+    start = start_of(plan, subject, variant)
+    return given_digest([start]) if start and isinstance(start, str) else ""
 
 
 def crop_text(plan: Plan, crop: str) -> str:

@@ -12,6 +12,7 @@ from nbavatar.config.sheets import Row, Subject, capture_subjects, read_rows, re
 from nbavatar.config.synthetic import refuse_others
 from nbavatar.config.tables import TableLayout, read_tables
 from nbavatar.errors import ConfigError, did_you_mean
+from nbavatar.planning.starts import checked_starts
 
 __all__ = ["Plan", "read_plan"]
 
@@ -24,12 +25,14 @@ class Plan:
         run: the configuration.
         subjects: by name.
         rows: what is to be made and judged, in the order of the sheet.
+        starts: subject and variant of the avatars that others start from, whether rows ask for them or not.
         tables, figures: layouts of those that can be made, by name.
     """
 
     run: RunConfig
     subjects: dict[str, Subject]
     rows: list[Row]
+    starts: list[tuple[str, str]]
     tables: dict[str, TableLayout]
     figures: dict[str, FigureLayout]
 
@@ -68,7 +71,8 @@ def read_plan(mapping: Mapping[str, Any]) -> Plan:
 
     Where one camera recorded a subject, none is held out: rows that would judge that camera are left out, and so are,
     where it is true of every subject, tables and figures that show nothing else. Where only some of the subjects are
-    wanted, the rows, pairs, tables and figures of the others are left out in the same way.
+    wanted, the rows, pairs, tables and figures of the others are left out in the same way; of the others, those stay
+    known whose avatars these start from.
 
     Raises:
         ConfigError: something malformed, a name that is not known, or a dataset of the user's where a synthetic one is
@@ -96,6 +100,7 @@ def read_plan(mapping: Mapping[str, Any]) -> Plan:
     for pair in run.reenact:
         for name in pair.split("/"):
             _check("reenact: unknown subject", name, subjects)
+    everybody = subjects
     if run.only:
         for name in run.only:
             _check("only: unknown subject", name, subjects)
@@ -113,7 +118,10 @@ def read_plan(mapping: Mapping[str, Any]) -> Plan:
     if not any(subject.test_camera for subject in subjects.values()):
         tables = {k: table for k, table in tables.items() if table.speeds or not all(map(held, table.protocols))}
         figures = {k: figure for k, figure in figures.items() if not held(figure.protocol)}
-    return Plan(run, subjects, rows, tables, figures)
+    starts = checked_starts(run, everybody, [(row.subject, row.variant) for row in rows])
+    known = {*subjects, *(name for name, _ in starts)}
+    subjects = {name: subject for name, subject in everybody.items() if name in known}
+    return Plan(run, subjects, rows, starts, tables, figures)
 
 
 def _check(what: str, name: str, known: Mapping[str, Any]) -> None:

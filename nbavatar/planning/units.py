@@ -11,6 +11,7 @@ from typing import TypeVar
 from nbavatar.config.sheets import Row
 from nbavatar.errors import ConfigError, did_you_mean
 from nbavatar.planning.run import Plan
+from nbavatar.planning.starts import start_of as find_start
 
 __all__ = [
     "Avatar",
@@ -34,6 +35,8 @@ __all__ = [
     "people",
     "reenactments",
     "rows_of_table",
+    "start_of",
+    "starts",
     "swept",
     "tables",
     "timed",
@@ -151,6 +154,17 @@ def crops(plan: Plan) -> list[Crop]:
 def avatars(plan: Plan) -> list[Avatar]:
     """What is trained."""
     return _once(Avatar(row.subject, row.variant) for row in plan.rows)
+
+
+def starts(plan: Plan) -> list[Avatar]:
+    """What is trained only because others start from it."""
+    return [avatar for named in plan.starts if (avatar := Avatar(*named)) not in avatars(plan)]
+
+
+def start_of(plan: Plan, subject: str, variant: str) -> Avatar | str:
+    """What a training starts from: an avatar of the run, a file, or nothing (empty)."""
+    start = find_start(plan.run, subject, variant)
+    return start if isinstance(start, str) else Avatar(*start)
 
 
 def tables(plan: Plan) -> list[Table]:

@@ -92,10 +92,15 @@ class RunFolder:
             # A folder without a readable key that holds nothing yet was cut off while it was being made.
             return not (key_file.parent / "state.pt").exists()
 
+    @property
+    def begun(self) -> bool:
+        """Whether there is a checkpoint to go on from."""
+        return (self.path / "state.pt").exists()
+
     def load(self) -> dict[str, Any] | None:
         """Last checkpoint, or None; events that were logged after it are dropped, they will be made again."""
         file = self.path / "state.pt"
-        if not file.exists():
+        if not self.begun:
             self._rewrite_events([])
             return None
         state = read_tensors(file, "a training state", fix=f"delete {self.path}")

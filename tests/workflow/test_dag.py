@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shlex
 import subprocess
 import sys
 
@@ -194,6 +195,36 @@ def test_a_comparison_has_avatars_of_its_own(project, tmp_path):
     # One shell serves all variants. No report, tables or videos.
     assert jobs["compare"] == 1 and jobs["shell"] == 1
     assert not {"table", "figure", "report", "video", "speed"} & jobs.keys()
+
+
+def test_a_training_that_starts_from_another_subjects_avatar_comes_after_it(project, tmp_path):
+    for name in ("ann", "ben"):
+        write_capture(tmp_path / name)
+    started = {"crop": "full", "meshes": "fit", "stages": {"train": {"start": "ann/full", "steps": 7}}}
+    (project.folder / "started.json").write_text(json.dumps({"variants": {"started": started}}))
+    words, files = ["--config", f"data_root={tmp_path}"], "config/capture.yaml started.json"
+    models = {one: f"results/capture/train/{one}/model.pt" for one in ("ann/full", "ann/started", "ben/started")}
+    done = project.snakemake("--quiet", "all", *words, "--", *list(models.values())[1:], config=files)
+    assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
+    calls = [shlex.split(call) for call in (project.folder / "calls").read_text().splitlines()]
+    trained = [call for call in calls if call[:1] == ["train"]]
+    made = [call[call.index("--out") + 1] for call in trained]
+    assert made[0] == models["ann/full"] and sorted(made) == sorted(models.values()), "what none asked for comes first"
+    told = [call[call.index("--start") + 1 : call.index("--out")] for call in trained]
+    assert told == [[], [models["ann/full"]], [models["ann/full"]]]
+
+    def planned(*more):
+        return project.plan(*words, "--", *list(models.values())[1:], config=" ".join([files, *more]))
+
+    assert planned() == {}
+    # Another start of the start, by its options, and a file of the user's in place of it.
+    (project.folder / "longer.json").write_text(json.dumps({"variants": {"full": {"stages": {"train": {"steps": 9}}}}}))
+    assert planned("longer.json") == {"train": 3}
+    (project.folder / "given.pt").write_text("a model")
+    (project.folder / "given.json").write_text(
+        json.dumps({"variants": {"started": {"stages": {"train": {"start": "given.pt"}}}}})
+    )
+    assert planned("given.json") == {"train": 2}
 
 
 def test_lint_is_clean(project):

@@ -54,6 +54,14 @@ def train_frames(wildcards):
     )
 
 
+def start_of(wildcards):
+    """The model that a training starts from, if any."""
+    start = units.start_of(PLAN, wildcards.subject, wildcards.variant)
+    if isinstance(start, units.Avatar):
+        return files(rules.train.output.model, [start])
+    return [start] if start else []
+
+
 def judged_frames(subject, protocol):
     """Crops that a protocol looks at."""
     try:

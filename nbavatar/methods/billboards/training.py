@@ -11,7 +11,7 @@ from nbavatar.config.training import TrainConfig
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
 from nbavatar.errors import ConfigError
-from nbavatar.methods.base import Method, StepLoss
+from nbavatar.methods.base import MeshAvatar, Method, StepLoss, Taken
 from nbavatar.methods.billboards.avatar import Anchor, Avatar
 from nbavatar.methods.billboards.compression.footprint import largest_footprints, texels_of
 from nbavatar.methods.billboards.compression.prune import prune
@@ -20,6 +20,7 @@ from nbavatar.methods.billboards.initial import initial_avatar, neighbour_graph
 from nbavatar.methods.billboards.objective import step_loss
 from nbavatar.methods.billboards.offsets import SmoothOffsets
 from nbavatar.methods.billboards.options import BillboardsConfig
+from nbavatar.methods.billboards.start import take_over
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import Plan
 
@@ -68,6 +69,11 @@ class BillboardTraining(Method):
         neighbours = neighbour_graph(avatar, sequence, config)
         offsets = SmoothOffsets(avatar, sequence, coords) if options.rates.offset > 0 else None
         return cls(avatar, None if neighbours is None else neighbours.to(device), config, offsets)
+
+    def take_over(self, other: MeshAvatar, parts: Sequence[str]) -> Taken:
+        """See `Method.take_over`."""
+        assert isinstance(other, Avatar)
+        return take_over(self.avatar, other, parts)
 
     def lpips_net(self) -> str | None:
         """See `Method.lpips_net`."""

@@ -46,6 +46,7 @@ class GaussianAvatars(GaussianAvatar):
     method: ClassVar[str] = "gaussian_avatars"
     PARAMETERS: ClassVar[tuple[str, ...]] = ("offset", *GaussianAvatar.PARAMETERS)
     BUFFERS: ClassVar[tuple[str, ...]] = ("binding",)
+    FACE: ClassVar[str] = "binding"
     binding: Tensor
 
     def __init__(

@@ -90,6 +90,6 @@ class GaussianAvatarsTraining(GaussianTraining):
         return StepLoss(total, {name: value.detach() for name, value in terms.items()}, seen)
 
     def between_steps(self, optimizer: Adam, step: int, random: torch.Generator) -> None:
-        """One more degree of harmonics every so often."""
+        """One more degree of harmonics every so often; those that a start brought stay in use."""
         degree = min(self.options.sh_degree, int(self.calendar.now // self.options.sh_interval))
-        self.avatar.degree.fill_(degree)
+        self.avatar.degree.clamp_(min=degree)

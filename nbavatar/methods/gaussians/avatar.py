@@ -43,6 +43,7 @@ class GaussianAvatar(MeshAvatar):
 
     Attributes:
         PARAMETERS, BUFFERS: names of what has one row a Gaussian; trained, and not.
+        FACE: of the buffers, the one that names the face on which each Gaussian rides, int64 (N,).
         quat: local rotations wxyz, normalised when used, (N, 4).
         log_scale: logarithms of the local scales, (N, 3).
         opacity_logit: opacities before the sigmoid, (N,).
@@ -53,6 +54,7 @@ class GaussianAvatar(MeshAvatar):
 
     PARAMETERS: ClassVar[tuple[str, ...]] = ("quat", "log_scale", "opacity_logit", "colour", "colour_rest")
     BUFFERS: ClassVar[tuple[str, ...]] = ()
+    FACE: ClassVar[str]
     degree: Tensor
 
     def __init__(
@@ -98,6 +100,16 @@ class GaussianAvatar(MeshAvatar):
             rows: parents, int64 (M,), each as often as it has children.
             noise: standard normal, (M, 3), along the parent's axes.
         """
+
+    def adapted(self, other: Any, rows: Tensor, faces: Tensor) -> dict[str, Tensor]:
+        """What Gaussians of another avatar hold here instead of a copy, by name; nothing where faces say it all.
+
+        Args:
+            other: avatar of the same method.
+            rows: its Gaussians, int64 (M,).
+            faces: the face of this avatar on which each of them will ride, int64 (M,).
+        """
+        return {}
 
     def spared(self, removed: Tensor) -> Tensor:
         """Which Gaussians may really be removed of those that shall be, bool (N,); one always stays."""

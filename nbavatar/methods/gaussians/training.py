@@ -10,11 +10,12 @@ from torch import Tensor
 
 from nbavatar.config.training import TrainConfig
 from nbavatar.data.views import Sample, View
-from nbavatar.methods.base import Method
+from nbavatar.methods.base import MeshAvatar, Method, Taken
 from nbavatar.methods.gaussians.avatar import GaussianAvatar, PosedGaussians
 from nbavatar.methods.gaussians.density import Statistics, densify, remove, reset_opacity
 from nbavatar.methods.gaussians.losses import Pair, compare
 from nbavatar.methods.gaussians.options import DensityConfig
+from nbavatar.methods.gaussians.start import take_over
 from nbavatar.optimization.adam import Adam
 from nbavatar.optimization.schedule import Plan, total_steps
 
@@ -130,6 +131,13 @@ class GaussianTraining(Method):
             {"name": name, "lr": rate * factor, "params": [parameter], "final": final}
             for name, rate, parameter, final in named
         ]
+
+    def take_over(self, other: MeshAvatar, parts: Sequence[str]) -> Taken:
+        """See `Method.take_over`; density control counts the Gaussians that there are then."""
+        assert isinstance(other, GaussianAvatar)
+        taken = take_over(self.avatar, other, parts)
+        self.statistics = Statistics(self.avatar.primitives, self.avatar.faces.device)
+        return taken
 
     def total_steps(self) -> int:
         """The budget's steps; the published number under `schedule: paper`."""

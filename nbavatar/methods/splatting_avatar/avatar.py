@@ -65,6 +65,7 @@ class SplattingAvatar(GaussianAvatar):
     method: ClassVar[str] = "splatting_avatar"
     PARAMETERS: ClassVar[tuple[str, ...]] = ("uvd", *GaussianAvatar.PARAMETERS)
     BUFFERS: ClassVar[tuple[str, ...]] = ("face", "bary")
+    FACE: ClassVar[str] = "face"
     face: Tensor
     bary: Tensor
     rest: Tensor
@@ -197,6 +198,23 @@ class SplattingAvatar(GaussianAvatar):
         face, bary = self._landed(faces, rows, step.detach().double().cpu().numpy())
         height = torch.cat((torch.zeros_like(self.uvd[rows, :2]), self.uvd[rows, 2:]), 1)
         return {"face": face, "bary": bary, "uvd": height}
+
+    def adapted(self, other: "SplattingAvatar", rows: Tensor, faces: Tensor) -> dict[str, Tensor]:
+        """Rotations and sizes where the rest poses differ: they count from there, and shall stay as to the triangle.
+
+        q' = q(R' R^T) q and s' = s + 1/2 log(A' / A), with the triangle's axes R, R' and areas A, A' in the rest poses
+        of the other avatar and of this one. Heights stay in metres.
+        """
+        before = other.face[rows]
+        if torch.equal(other.rest[other.faces[before]], self.rest[self.faces[faces]]):
+            return {}
+        (axes_before, area_before, _), (axes, area, _) = other._at_rest(), self._at_rest()
+        turn = matrix_to_quaternion(axes[faces] @ axes_before[before].transpose(1, 2))
+        ratio = area[faces].clamp_min(_TINY) / area_before[before].clamp_min(_TINY)
+        return {
+            "quat": quaternion_multiply(turn, normalize_quaternion(other.quat[rows])),
+            "log_scale": other.log_scale[rows] + 0.5 * ratio.log()[:, None],
+        }
 
     def content(self) -> dict[str, Any]:
         """Mode and degree of the harmonics."""
