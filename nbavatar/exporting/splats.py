@@ -48,14 +48,14 @@ def splat_columns(
         )  # fmt: skip
     with torch.no_grad():
         posed = avatar.pose(avatar.anchor(verts, frame))
-        rows = slice(None) if posed.rows is None else posed.rows
+        harmonics = avatar.appearance(posed)[1]
         used = (int(avatar.degree) + 1) ** 2 - 1
         rest = torch.zeros(len(posed.means), 3, _REST)
-        rest[:, :, :used] = avatar.colour_rest[rows, :used].transpose(1, 2).cpu()
+        rest[:, :, :used] = harmonics[:, 1 : 1 + used].transpose(1, 2).cpu()
         tables = {
-            "f_dc": avatar.colour[rows, 0],
+            "f_dc": harmonics[:, 0],
             "f_rest": rest.flatten(1),
-            "opacity": avatar.opacity_logit[rows, None],
+            "opacity": avatar.logits(posed)[:, None],
             "scale": posed.scales.clamp_min(1e-30).log(),
             "rot": torch.nn.functional.normalize(posed.quats, dim=1),
         }

@@ -173,10 +173,9 @@ def _primitives(
     anchor = avatar.anchor(verts, frame)
     if isinstance(avatar, GaussianAvatar):
         posed = avatar.pose(anchor)
-        colours = _colours(avatar.primitives).to(background)
-        opacity = torch.sigmoid(avatar.opacity_logit)
+        colours, opacity = _colours(avatar.primitives).to(background), avatar.appearance(posed)[0]
         if posed.rows is not None:
-            colours, opacity = colours[posed.rows], opacity[posed.rows]
+            colours = colours[posed.rows]
         shown = render_gaussians(posed.means, posed.quats, posed.scales, opacity, colours, viewmat, K, width, height)
         colour, alpha = shown.colour, shown.alpha
     else:

@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from nbavatar.imports import imports_of
+from nbavatar.methods.registry import METHODS
+
 # A GPU node needs torch, numpy, numba, Pillow, tqdm and yaml; these belong to the stages that use them.
 HEAVY = (
     "igl",
@@ -29,6 +32,26 @@ def test_layers_import_downwards_only():
         assert lint_imports() == 0
     else:
         assert out.returncode == 0, out.stdout
+
+
+ABOVE_METHODS = (
+    "api", "checks", "cli", "detection", "evaluation", "exporting", "fitting", "reporting", "studies", "training",
+    "viewer",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_of_the_registry_imports_no_other_method_and_nothing_above(method):
+    # The contract in pyproject.toml lists packages by name; this one holds for a method as soon as it is registered.
+    rooms = {entry.training.partition(":")[0].rpartition(".")[0] for entry in METHODS.values()}
+    room = METHODS[method].training.partition(":")[0].rpartition(".")[0]
+    refused = (*(rooms - {room}), *(f"nbavatar.{layer}" for layer in ABOVE_METHODS))
+    folder = Path(__file__).parents[2].joinpath(*room.split("."))
+    modules = [f"{room}.{'.'.join(p.relative_to(folder).with_suffix('').parts)}" for p in folder.rglob("*.py")]
+    assert len(modules) > 2
+    for module in modules:
+        for name in imports_of(module.removesuffix(".__init__")):
+            assert not any(name == other or name.startswith(f"{other}.") for other in refused), (module, name)
 
 
 @pytest.mark.parametrize("verb", ["train", "render", "speed"])

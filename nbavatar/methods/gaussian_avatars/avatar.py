@@ -1,122 +1,29 @@
-"""GaussianAvatars (Qian et al., CVPR 2024): 3D Gaussians bound to the triangles of a mesh.
+"""GaussianAvatars (Qian et al., CVPR 2024): 3D Gaussians bound to the triangles of a mesh, and nothing else.
 
-A Gaussian keeps the triangle it was born on, and so do its children. It lives in the triangle's frame {T, R, k}
-(`nbavatar.mesh.frames`: origin in the centroid, an axis along the first edge and one along the normal, k the mean of
-that edge and the height over it):
-
-    x = k R x_l + T        q = R q_l        s = k exp(s_l)
-
-There is one Gaussian a triangle at the start, at the origin and of the triangle's size, and always at least one.
+How they are bound is `nbavatar.methods.gaussians.bound`.
 """
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from nbavatar.math.rotations import matrix_to_quaternion, normalize_quaternion, quaternion_multiply
-from nbavatar.mesh.frames import FaceFrames, face_frames
-from nbavatar.methods.gaussians.avatar import GaussianAvatar, PosedGaussians
+from nbavatar.methods.gaussians.bound import BoundGaussians, check_binding
 
-__all__ = ["BoundAnchor", "GaussianAvatars"]
+__all__ = ["GaussianAvatars"]
 
 
-class BoundAnchor(NamedTuple):
-    """Where the triangles of one frame are.
-
-    Attributes:
-        frames: face frames of all parts; quats: their rotations, wxyz (F, 4).
-        shown: whether a face's part is there, bool (F,), or None for all.
-    """
-
-    frames: FaceFrames
-    quats: Tensor
-    shown: Tensor | None
-
-
-class GaussianAvatars(GaussianAvatar):
-    """Gaussians bound to triangles.
-
-    Attributes:
-        offset: local positions [k], (N, 3).
-        binding: face of each Gaussian, int64 (N,).
-    """
+class GaussianAvatars(BoundGaussians):
+    """Gaussians bound to triangles."""
 
     method: ClassVar[str] = "gaussian_avatars"
-    PARAMETERS: ClassVar[tuple[str, ...]] = ("offset", *GaussianAvatar.PARAMETERS)
-    BUFFERS: ClassVar[tuple[str, ...]] = ("binding",)
-    FACE: ClassVar[str] = "binding"
-    binding: Tensor
-
-    def __init__(
-        self,
-        faces: Mapping[str, Tensor],
-        vertex_counts: Mapping[str, int],
-        *,
-        colour: Tensor,
-        opacity: float,
-        sh_degree: int,
-        record: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Args: as of `GaussianAvatar`; colour (F, 3) of the first Gaussian of each face."""
-        super().__init__(
-            faces,
-            vertex_counts,
-            log_scale=torch.zeros(len(colour), 3),
-            colour=colour,
-            opacity=opacity,
-            sh_degree=sh_degree,
-            record=record,
-        )
-        self.offset = nn.Parameter(torch.zeros(len(colour), 3))
-        self.register_buffer("binding", torch.arange(len(colour)))
-
-    def anchor(self, verts: Mapping[str, Tensor], frame: str | None = None) -> BoundAnchor:
-        """See `MeshAvatar.anchor`."""
-        points, keep = self.merged(verts)
-        frames = face_frames(points, self.faces)
-        shown = None
-        if keep is not None:
-            shown = torch.zeros(len(self.faces), dtype=torch.bool, device=self.faces.device)
-            shown[keep] = True
-        return BoundAnchor(frames, matrix_to_quaternion(frames.R), shown)
-
-    def pose(self, anchor: BoundAnchor) -> PosedGaussians:
-        """See `GaussianAvatar.pose`."""
-        rows, binding = None, self.binding
-        offset, quat, scales = self.offset, self.quat, self.local_scales()
-        if anchor.shown is not None:
-            rows = anchor.shown[binding].nonzero().squeeze(1)
-            binding, offset, quat, scales = binding[rows], offset[rows], quat[rows], scales[rows]
-        size = anchor.frames.k[binding][:, None]
-        means = torch.einsum("nij,nj->ni", anchor.frames.R[binding], offset) * size + anchor.frames.T[binding]
-        quats = quaternion_multiply(anchor.quats[binding], normalize_quaternion(quat))
-        return PosedGaussians(means, quats, scales * size, rows)
-
-    def offspring(self, rows: Tensor, noise: Tensor) -> dict[str, Tensor]:
-        """A child sits at a random point of its parent, on the same triangle.
-
-        (The public code forgets the parent's place and puts children at the triangle's centre.)
-        """
-        return {"offset": self.offset[rows] + self.local_offsets(rows, noise)}
-
-    def spared(self, removed: Tensor) -> Tensor:
-        """Where a face would lose its last Gaussian, it keeps all it has."""
-        left = torch.zeros(len(self.faces), dtype=torch.int64, device=removed.device)
-        left.index_add_(0, self.binding, (~removed).long())
-        return removed & (left[self.binding] > 0)
-
-    def content(self) -> dict[str, Any]:
-        """Degree of the harmonics."""
-        return {"sh_degree": self.sh_degree}
 
     @classmethod
     def rebuild(
         cls, content: Mapping[str, Any], state: Mapping[str, Tensor], record: Mapping[str, Any]
     ) -> "GaussianAvatars":
         """See `MeshAvatar.rebuild`."""
-        faces = sum(len(part) for part in content["faces"].values())
         avatar = cls(
             content["faces"],
             content["vertex_counts"],
@@ -125,7 +32,5 @@ class GaussianAvatars(GaussianAvatar):
             sh_degree=int(content["sh_degree"]),
             record=record,
         )
-        binding = state["binding"]
-        if len(binding) and not (0 <= int(binding.min()) and int(binding.max()) < faces):
-            raise ValueError(f"binding names faces beyond the {faces} there are")
+        check_binding(content, state)
         return avatar

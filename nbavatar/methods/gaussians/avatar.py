@@ -30,12 +30,18 @@ class PosedGaussians(NamedTuple):
         quats: unit, wxyz (M, 4).
         scales: (M, 3) [m].
         rows: which Gaussians these are, int64 (M,), or None for all.
+        opacity_logit: opacities of this pose before the sigmoid, (M,); None: the Gaussians' own.
+        harmonics: of this pose, all degrees, (M, K, 3); None: the Gaussians' own.
+        change: what this pose adds to the Gaussians' own numbers, (M, D); None: nothing.
     """
 
     means: Tensor
     quats: Tensor
     scales: Tensor
     rows: Tensor | None
+    opacity_logit: Tensor | None = None
+    harmonics: Tensor | None = None
+    change: Tensor | None = None
 
 
 class GaussianAvatar(MeshAvatar):
@@ -128,6 +134,23 @@ class GaussianAvatar(MeshAvatar):
         turn = quaternion_to_matrix(normalize_quaternion(self.quat[rows]))
         return torch.einsum("nij,nj->ni", turn, self.local_scales()[rows] * noise)
 
+    def logits(self, posed: PosedGaussians) -> Tensor:
+        """Opacities of posed Gaussians before the sigmoid, (M,)."""
+        if posed.opacity_logit is not None:
+            return posed.opacity_logit
+        return self.opacity_logit if posed.rows is None else self.opacity_logit[posed.rows]
+
+    def appearance(self, posed: PosedGaussians) -> tuple[Tensor, Tensor]:
+        """Opacities in [0, 1] (M,) and harmonics (M, K, 3) of posed Gaussians."""
+        own = posed.opacity_logit is None
+        opacity = torch.sigmoid(self.opacity_logit if own else posed.opacity_logit)
+        if own and posed.rows is not None:
+            opacity = opacity[posed.rows]
+        if posed.harmonics is not None:
+            return opacity, posed.harmonics
+        colour = torch.cat((self.colour, self.colour_rest), 1)
+        return opacity, colour if posed.rows is None else colour[posed.rows]
+
     def splat(
         self,
         posed: PosedGaussians,
@@ -138,9 +161,7 @@ class GaussianAvatar(MeshAvatar):
         screen_offsets: Tensor | None = None,
     ) -> SplatImage:
         """Render posed Gaussians; `screen_offsets` (M, 2) collects the gradient by the projected centres."""
-        opacity, colour = torch.sigmoid(self.opacity_logit), torch.cat((self.colour, self.colour_rest), 1)
-        if posed.rows is not None:
-            opacity, colour = opacity[posed.rows], colour[posed.rows]
+        opacity, colour = self.appearance(posed)
         return render_gaussians(
             posed.means,
             posed.quats,

@@ -91,7 +91,8 @@ def test_an_edit_of_one_method_changes_its_jobs_alone(package, name):
 def test_a_new_option_of_one_method_changes_its_jobs_alone(package):
     before = keys(package)
     path = package / "methods/gaussian_avatars/options.py"
-    edit(path, "    sh_interval: int", '    extra: float = option(1.0, "Another.", min=0)\n    sh_interval: int')
+    edit(path, "(BoundConfig):", '(BoundConfig):\n    extra: float = option(1.0, "Another.", min=0)')
+    edit(path, "from nbavatar.methods", "from nbavatar.config.core import option\nfrom nbavatar.methods")
     after = keys(package)
     assert after["gaussian_avatars"][2]["gaussian_avatars"]["extra"] == 1.0
     assert {method for method in before if after[method] != before[method]} == {"gaussian_avatars"}

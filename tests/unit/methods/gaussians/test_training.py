@@ -14,10 +14,10 @@ from nbavatar.data.views import ViewStore, views_of
 from nbavatar.errors import DataError
 from nbavatar.io.framepack import FramePack
 from nbavatar.methods.create import create_method
-from nbavatar.methods.gaussian_avatars.options import GaussianAvatarsConfig, GaussianAvatarsRates
+from nbavatar.methods.gaussian_avatars.options import GaussianAvatarsConfig
 from nbavatar.methods.gaussians.avatar import GaussianAvatar
 from nbavatar.methods.gaussians.density import densify, remove, reset_opacity
-from nbavatar.methods.gaussians.options import DensityConfig
+from nbavatar.methods.gaussians.options import BoundRates, DensityConfig
 from nbavatar.methods.splatting_avatar.options import (
     SplattingAvatarConfig,
     SplattingAvatarRates,
@@ -89,7 +89,7 @@ def same(a, b) -> bool:
 def test_it_learns(tmp_path, config) -> None:
     # Rates of a short training; density as published: at this length one densification and no reset.
     rates = {"colour": 0.1, "opacity": 0.2, "scale": 0.05}
-    bound = replace(config.gaussian_avatars, density=DensityConfig(), rates=GaussianAvatarsRates(**rates))
+    bound = replace(config.gaussian_avatars, density=DensityConfig(), rates=BoundRates(**rates))
     embedded = replace(config.splatting_avatar, density=SplattingDensityConfig(), rates=SplattingAvatarRates(**rates))
     config = replace(config, steps=50, gaussian_avatars=bound, splatting_avatar=embedded)
     fine = write_scene(tmp_path / "fine", meshes=subdivided(sequence()))
