@@ -26,9 +26,10 @@ _SHARED = ("ingest", "masks", "crop", "tracks", "fit", "spectral", "deform")
 _BUDGETS: tuple[tuple[str, dict[str, Any], str], ...] = (
     ("a tenth of the steps", {"share": 0.1}, "converged textures: every number, by an amount that nobody has measured"),
     ("S2 alone", {"only": ["S2"]}, "means over subjects, cross-reenactment, and the rows of S1, S3 and S4"),
-    ("our method alone", {"without": "avatar"}, "the baselines: rows SA and GA"),
-    ("no ablations, no channels", {"keep": ("full", "full512", "gaussian_avatars", "splatting_avatar",
-     "splatting_avatar_released")}, "tables ablation and channels but for their full method"),
+    ("our method alone", {"without": "avatar"}, "the other methods: rows SA, GA and after IA"),
+    ("no ablations, no channels", {"keep": ("full", "full512", "gaussian_avatars", "interact_avatar",
+     "interact_avatar512", "splatting_avatar", "splatting_avatar_released")},
+     "tables ablation and channels but for their full method"),
 )  # fmt: skip
 
 

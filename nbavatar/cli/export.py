@@ -1,6 +1,6 @@
 """An avatar or its meshes in the files of other programs.
 
-    --to splats      Gaussians as 3DGS .ply, one file a frame (methods gaussian_avatars and splatting_avatar)
+    --to splats      Gaussians as 3DGS .ply, one file a frame (every method of Gaussians)
     --to billboards  textured quads as .glb (billboards trained with deferred: false)
     --to meshes      the posed meshes, vertices in contact red: .obj, .ply or .glb, one file a frame, or one .glb
     --to tensors     every tensor of the avatar as .safetensors; docs/export.md is the schema

@@ -45,6 +45,13 @@ METHODS: dict[str, MethodEntry] = {
         title="GaussianAvatars",
         primitives="Gaussians",
     ),
+    "interact_avatar": MethodEntry(
+        avatar="nbavatar.methods.interact_avatar.avatar:InteractAvatar",
+        training="nbavatar.methods.interact_avatar.training:InteractAvatarTraining",
+        options="nbavatar.methods.interact_avatar.options:InteractAvatarConfig",
+        title="after InteractAvatar",
+        primitives="Gaussians",
+    ),
     "splatting_avatar": MethodEntry(
         avatar="nbavatar.methods.splatting_avatar.avatar:SplattingAvatar",
         training="nbavatar.methods.splatting_avatar.training:SplattingAvatarTraining",

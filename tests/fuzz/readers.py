@@ -351,6 +351,7 @@ READERS = {
     "vertex maps": Reader(seeds.vertex_maps, _vertex_maps, "zip"),
     "model.pt, billboards": Reader(lambda d: seeds.avatar(d, "billboards"), _avatar, "zip"),
     "model.pt, GaussianAvatars": Reader(lambda d: seeds.avatar(d, "gaussian_avatars"), _avatar, "zip"),
+    "model.pt, after InteractAvatar": Reader(lambda d: seeds.avatar(d, "interact_avatar"), _avatar, "zip"),
     "model.pt, SplattingAvatar": Reader(lambda d: seeds.avatar(d, "splatting_avatar"), _avatar, "zip"),
     "state.pt": Reader(seeds.state, _state, "zip"),
     "events.jsonl of a training": Reader(lambda d: seeds.state(d).with_name("events.jsonl"), _state, "json", False),

@@ -65,11 +65,20 @@ def _avatar(method: str) -> Any:
     from nbavatar.methods.billboards.billboards import Billboards
     from nbavatar.methods.billboards.refine import Refinement
     from nbavatar.methods.gaussian_avatars.avatar import GaussianAvatars
+    from nbavatar.methods.interact_avatar.avatar import InteractAvatar
+    from nbavatar.methods.interact_avatar.posture import learn_posture
     from nbavatar.methods.splatting_avatar.avatar import SplattingAvatar
 
     faces = {"head": torch.from_numpy(toy.OCTAHEDRON_FACES)}
     if method == "gaussian_avatars":
         return GaussianAvatars(faces, {"head": 6}, colour=torch.zeros(8, 3), opacity=0.1, sh_degree=1)
+    if method == "interact_avatar":
+        posture = learn_posture(toy.OCTAHEDRON, toy.OCTAHEDRON[None], 2)
+        parts = ("head", "right_hand")
+        return InteractAvatar(
+            dict.fromkeys(parts, faces["head"]), dict.fromkeys(parts, 6), postures=dict.fromkeys(parts, posture),
+            width=2, features=2, points=3, reach=0.1, colour=torch.zeros(16, 3), opacity=0.1, sh_degree=1,
+        )  # fmt: skip
     if method == "splatting_avatar":
         return SplattingAvatar(
             faces, {"head": 6}, rest=torch.from_numpy(toy.OCTAHEDRON), face=torch.arange(8),

@@ -21,6 +21,7 @@ from nbavatar.rendering.gaussians.functional import render_gaussians
 from tests.scenes.toy import sequence
 from tests.unit.methods.billboards.test_model import make_avatar
 from tests.unit.methods.gaussians.test_avatars import bound, embedded
+from tests.unit.methods.interact_avatar.scenes import made, stirred
 
 VIEW = torch.eye(4)
 VIEW[2, 3] = 1.0
@@ -57,9 +58,13 @@ def read_splats(path) -> dict[str, np.ndarray]:
     return dict(zip(names, table.T, strict=True))
 
 
-@pytest.mark.parametrize("kind", ["bound", "paper", "released"])
+@pytest.mark.parametrize("kind", ["bound", "touched", "paper", "released"])
 def test_splats_are_what_viewers_of_3dgs_expect(tmp_path, meshes, kind) -> None:
-    avatar = bound() if kind == "bound" else embedded(kind)
+    whole = sequence()
+    if kind == "touched":
+        avatar = stirred(made(whole)).avatar
+    else:
+        avatar = bound() if kind == "bound" else embedded(kind)
     avatar.degree.fill_(avatar.sh_degree)
     with torch.no_grad():
         avatar.colour.normal_()
@@ -85,7 +90,7 @@ def test_splats_are_what_viewers_of_3dgs_expect(tmp_path, meshes, kind) -> None:
         means, table("rot", 4), table("scale", 3).exp(), torch.from_numpy(read["opacity"]).sigmoid(), harmonics,
         VIEW, K, 48, 48, sh_degree=3,
     )  # fmt: skip
-    verts = {"head": torch.from_numpy(sequence().parts["head"].verts[2])}
+    verts = {part: torch.from_numpy(whole.parts[part].verts[2]) for part in avatar.parts}
     with torch.no_grad():
         own, alpha, _ = avatar.render(verts, VIEW, K, 48, 48, torch.zeros(3))
     assert float(alpha.max()) > 0.05 and len(means) == avatar.primitives

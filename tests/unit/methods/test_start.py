@@ -37,7 +37,9 @@ SPLATTING_AVATAR = replace(
     method="splatting_avatar",
     splatting_avatar=SplattingAvatarConfig(samples=120, weight_lpips=0.0),
 )
-ALL = pytest.mark.parametrize("config", [BILLBOARDS, GAUSSIAN_AVATARS, SPLATTING_AVATAR], ids=lambda c: c.method)
+INTERACT_AVATAR = replace(BILLBOARDS, method="interact_avatar")
+EVERY = [BILLBOARDS, GAUSSIAN_AVATARS, INTERACT_AVATAR, SPLATTING_AVATAR]
+ALL = pytest.mark.parametrize("config", EVERY, ids=lambda c: c.method)
 
 
 def person(stretch: float, shell: np.ndarray, *, turn: np.ndarray | None = None) -> MeshSequence:
@@ -325,12 +327,12 @@ def test_a_training_says_what_it_took_over_and_goes_on_after_a_kill(
     start = tmp_path / "start.pt"
     save_avatar(start, trained(scenes["one"], config))
     assert main(words(scenes["two"], tmp_path / "whole.pt", config, start)) == 0
-    unet = ", U-Net" if config.method == "billboards" else ""
-    line = f"{start}: took over head, right_hand{unet}; not shell (another mesh)\n"
+    nets = {"billboards": ["U-Net"], "interact_avatar": ["networks of right_hand", "networks of the face"]}
+    over = ["head", "right_hand", *nets.get(config.method, [])]
+    line = f"{start}: took over {', '.join(over)}; not shell (another mesh)\n"
     assert line in capsys.readouterr().err
     whole = load_avatar(tmp_path / "whole.pt")
     assert whole.record["inputs"]["start"] == file_digest(start)
-    over = ["head", "right_hand", *(["U-Net"] if unet else [])]
     assert whole.record["start"] == {"over": over, "left": ["shell (another mesh)"]}
 
     out = tmp_path / "cut.pt"

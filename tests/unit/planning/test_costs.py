@@ -60,12 +60,13 @@ def test_the_work_of_the_paper_is_that_of_its_sheets():
         jobs[work.rule] = jobs.get(work.rule, 0) + work.jobs
     assert jobs == {
         "ingest": 32, "masks": 32, "crop": 64, "tracks": 4, "fit": 4, "spectral": 4, "deform": 4, "reenact": 4,
-        "reenact_contact": 4, "train": 28, "render": 48, "evaluate": 48, "speed": 7, "video": 8, "tradeoff": 1,
+        "reenact_contact": 4, "train": 36, "render": 64, "evaluate": 64, "speed": 8, "video": 8, "tradeoff": 1,
         "savings": 1, "offline": 1, "extremes": 1, "collect": 1, "report": 1, "table": 8, "figure": 10,
     }  # fmt: skip
     steps = {work.of: work.count for work in works if work.rule == "train"}
     assert steps["full"] == steps["no_dnr"] == 400_000
     assert (steps["gaussian_avatars"], steps["splatting_avatar"]) == (600_000, 30_000)
+    assert steps["interact_avatar"] == steps["interact_avatar512"] == 600_000
     images = {work.count for work in works if work.rule == "render" and work.of == "full"}
     assert images == {1630 - 326, 326 * 7}  # novel views of training frames; held-out frames in seven cameras
     assert sweep_pictures(SHEET) == 2 * (2 + 2 * 4)

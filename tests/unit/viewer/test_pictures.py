@@ -12,8 +12,9 @@ from nbavatar.methods.billboards.engine import installed_engines
 from nbavatar.viewer.eye import Eye, free_eye, pose_of, view_angle
 from nbavatar.viewer.pictures import SHOWS, Request, draw
 from nbavatar.viewer.scene import Entry, Scene
-from tests.scenes.toy import SIZE, camera, write_scene
+from tests.scenes.toy import SIZE, camera, sequence, write_scene
 from tests.unit.methods.billboards.test_model import make_avatar
+from tests.unit.methods.interact_avatar.scenes import made, stirred
 
 GREEN = (0.0, 0.5, 0.2)
 
@@ -112,6 +113,23 @@ def test_the_first_view_is_the_middle_cameras_and_shows_the_avatar_without_camer
     pixels, depth = project(points, K, facing_pose(view.position, view.look_at, alone.up))
     head = pixels[:6]
     assert (depth > 0).all() and 0 < head.min() and head.max() < 1 and np.ptp(head[:, 1]) > 0.5
+
+
+def test_gaussians_that_a_pose_changes_are_shown_with_that_poses_opacity(scene) -> None:
+    avatar = stirred(made(sequence())).avatar.eval()
+    scene.entries["touched"] = Entry("touched", lambda: (avatar, sequence()))
+    shown = []
+    for colour in ((0.0,) * 3, (1.0,) * 3):
+        drawn = draw(scene, Request(eye_of(scene), "f2", "touched", show="billboards", background=colour), SIZE)
+        shown.append(drawn.image / 255.0)
+    K, pose, *_ = scene.camera("cam0", "f2")
+    verts, own = scene.entries["touched"].vertices("f2", "cpu")
+    with torch.no_grad():
+        view = torch.tensor(pose).float(), torch.tensor(K).float()
+        alpha = avatar.render(verts, *view, SIZE, SIZE, torch.zeros(3), frame=own)[1].numpy()
+    assert alpha.max() > 0.1
+    for channel in range(3):
+        np.testing.assert_allclose(1 - (shown[1] - shown[0])[..., channel], alpha, atol=1.01 / 255)
 
 
 def test_the_browsers_camera_is_a_pinhole_of_the_conventions() -> None:

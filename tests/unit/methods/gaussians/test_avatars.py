@@ -249,7 +249,7 @@ def test_camera_extent() -> None:
 
 
 def test_importing_the_baselines_loads_nothing_heavy() -> None:
-    modules = "gaussian_avatars.training", "splatting_avatar.training"
+    modules = "gaussian_avatars.training", "interact_avatar.training", "splatting_avatar.training"
     code = "import sys, " + ", ".join(f"nbavatar.methods.{name}" for name in modules)
     code += "; heavy = {'cv2', 'igl', 'scipy', 'trimesh', 'OpenEXR', 'matplotlib', 'pandas'} & set(sys.modules)"
     code += "; assert not heavy, heavy"

@@ -1,4 +1,4 @@
-"""Both baselines on the toy scene: they learn, keep their books in order, and resume exactly."""
+"""All methods of Gaussians on the toy scene: they learn, keep their books in order, and resume exactly."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from nbavatar.methods.gaussian_avatars.options import GaussianAvatarsConfig
 from nbavatar.methods.gaussians.avatar import GaussianAvatar
 from nbavatar.methods.gaussians.density import densify, remove, reset_opacity
 from nbavatar.methods.gaussians.options import BoundRates, DensityConfig
+from nbavatar.methods.interact_avatar.options import InteractAvatarConfig, InteractAvatarRates
 from nbavatar.methods.splatting_avatar.options import (
     SplattingAvatarConfig,
     SplattingAvatarRates,
@@ -51,9 +52,16 @@ SPLATTING_AVATAR = replace(
         samples=120, weight_lpips=0.0, density=SplattingDensityConfig(**{**DENSE, "interval": 100})
     ),
 )
+INTERACT_AVATAR = replace(
+    CONFIG,
+    method="interact_avatar",
+    interact_avatar=InteractAvatarConfig(density=DensityConfig(**DENSE), width=16, features=8),
+)
 RELEASED = replace(SPLATTING_AVATAR, splatting_avatar=replace(SPLATTING_AVATAR.splatting_avatar, mode="released"))
 ALL = pytest.mark.parametrize(
-    "config", [GAUSSIAN_AVATARS, SPLATTING_AVATAR, RELEASED], ids=["gaussian_avatars", "splatting_avatar", "released"]
+    "config",
+    [GAUSSIAN_AVATARS, INTERACT_AVATAR, SPLATTING_AVATAR, RELEASED],
+    ids=["gaussian_avatars", "interact_avatar", "splatting_avatar", "released"],
 )
 
 
@@ -91,7 +99,8 @@ def test_it_learns(tmp_path, config) -> None:
     rates = {"colour": 0.1, "opacity": 0.2, "scale": 0.05}
     bound = replace(config.gaussian_avatars, density=DensityConfig(), rates=BoundRates(**rates))
     embedded = replace(config.splatting_avatar, density=SplattingDensityConfig(), rates=SplattingAvatarRates(**rates))
-    config = replace(config, steps=50, gaussian_avatars=bound, splatting_avatar=embedded)
+    touched = replace(config.interact_avatar, density=DensityConfig(), rates=InteractAvatarRates(**rates))
+    config = replace(config, steps=50, gaussian_avatars=bound, interact_avatar=touched, splatting_avatar=embedded)
     fine = write_scene(tmp_path / "fine", meshes=subdivided(sequence()))
     method, summary = run(fine, config, tmp_path / "state")
     assert summary["skipped"] == 0 and summary["primitives"] == method.avatar.primitives
