@@ -43,6 +43,9 @@ HERE = {
         {"/tmp/model.pt": "by_hand/model.pt"}, "--set steps=2", ("by_hand/model.pt",)
     ),
     "nbavatar view results/smoke": Case(says="viewer: http://127.0.0.1:"),
+    "nbavatar view /tmp/model.pt": Case(
+        {"/tmp/model.pt": "results/smoke/train/S2/full/model.pt"}, says="viewer: http://127.0.0.1:"
+    ),
     "nbavatar view MODEL": Case(
         _CAMERAS | {"[MODEL": "results/smoke/train/S2/no_dnr/model.pt", "...]": ""},
         says="viewer: http://127.0.0.1:",
@@ -120,6 +123,7 @@ PLANNED = {
         "train",
         "minutes; its jobs run in the smoke run",
     ),
+    "snakemake --configfile config/capture.yaml --config data_root=/path/to/capture": ("tradeoff", "tens of minutes"),
     "snakemake table_ablation": ("table", "minutes; .ci/run runs it in the smoke run"),
     "snakemake subject_S2": ("train", "minutes; .ci/run runs it in the smoke run"),
     "snakemake stage_deform": ("deform", "minutes; .ci/run runs it in the smoke run"),
@@ -128,6 +132,8 @@ PLANNED = {
 # Run elsewhere: beginning -> the file that does, and what stands there.
 ELSEWHERE = {
     "nbavatar run paper --profile slurm": ("tests/cluster/test_slurm.py", "profiles/slurm"),
+    "nbavatar tradeoff": ("tests/unit/cli/test_tradeoff.py", '"tradeoff"'),
+    "nbavatar render": ("tests/unit/cli/test_tradeoff.py", '"--max-ms"'),
     "nbavatar detect": ("tests/unit/detection/test_models.py", '"detect"'),
     "nbavatar segment CAPTURE --method person": ("tests/unit/cli/test_segment.py", '"person"'),
     "python -m pytest tests/unit/rendering/billboards/test_cuda_simulator.py": (".ci/run", "make test"),
@@ -140,6 +146,7 @@ NOT_RUN = {
     "nbavatar doctor --gpu": "needs a GPU; what it does with one is tried on the CPU in test_device_check.py",
     "pip": "tests install nothing; .ci/run installs from the locks, test_packaging.py builds the wheel",
     "python -m pip": "tests install nothing",
+    "python -m build": "it downloads what the build needs; test_packaging.py builds the wheel",
     "git clone": "the address is the reader's; .ci/run clones the repository",
     "cd nbavatar": "follows `git clone`",
     "ffmpeg": "another program",
@@ -161,7 +168,7 @@ def commands_of(page: Path) -> list[str]:
     text, found = page.read_text(encoding="utf-8"), []
     for block in re.findall(r"^```sh\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL):
         for line in block.replace("\\\n", " ").splitlines():
-            line = re.sub(r"\s+#.*$", "", line).strip()
+            line = re.sub(r"(^|\s+)#.*$", "", line).strip()
             line = re.sub(r"^for \w+ in [^;]*; do (.*); done$", r"\1", line)
             found += [" ".join(part.split()).replace(".venv/bin/", "") for part in line.split(" && ") if part]
     return found + re.findall(r"^\| `(nbavatar [^`]+)` \|", text, flags=re.MULTILINE)

@@ -33,10 +33,14 @@ def test_the_tables_hold_no_command_that_is_gone():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_stand_in_blocks_of_shell(page):
-    """In a block without a language a command would be seen by no test."""
-    for language, block in re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S):
-        commands = re.findall(r"^(?:\.venv/bin/)?(?:nbavatar|snakemake|make) .*", block, re.M)
-        assert language == "sh" or not commands, commands
+    """Elsewhere, in a block without a language or in an indented one, they would be seen by no test."""
+    text = page.read_text(encoding="utf-8")
+    others = [block for language, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.M | re.S) if language != "sh"]
+    others += re.findall(r"^ {4}(.*)", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S), re.M)
+    commands = [
+        line for block in others for line in re.findall(r"^(?:\.venv/bin/)?(?:nbavatar|snakemake|make) .*", block, re.M)
+    ]
+    assert not commands
 
 
 def parser_of(verb: str) -> argparse.ArgumentParser:

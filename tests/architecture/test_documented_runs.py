@@ -19,13 +19,14 @@ from nbavatar.cli import main
 from nbavatar.methods.storage import save_avatar
 from tests.architecture.documented import COMMANDS, HERE, PLANNED, ROOT, Case, known
 from tests.scenes import foreign
-from tests.scenes.solid import write_solid
+from tests.scenes.solid import CAMERAS, write_solid
 from tests.scenes.tiny_sam3 import write_tiny_sam3
 from tests.scenes.toy import write_scene
 from tests.scenes.training import train_options
 from tests.unit.methods.billboards.test_model import make_avatar
 from tests.unit.methods.gaussians.test_avatars import bound
 from tests.workflow import imported
+from tools.pictures import WANTED
 
 pytestmark = pytest.mark.slow
 
@@ -90,7 +91,7 @@ def _make_run(here: Path) -> None:
 
 def _make_captures(here: Path) -> None:
     write_solid(here / "capture")
-    write_solid(here / "captures/one")
+    write_solid(here / "captures/S2")
     assert main("tracks --layout capture --root capture --subject me --out capture.npz".split()) == 0
     for name, without in (("bare", "meshes"), ("unmasked", "masks")):
         shutil.copytree(here / "capture", here / name)
@@ -193,7 +194,7 @@ def planned(words: list[str], where: Path) -> str:
         done = subprocess.run(words, cwd=where, env=ENVIRONMENT, capture_output=True, text=True)
     else:
         configured = [] if "--configfile" in words else ["--configfile", "config/smoke.yaml"]  # the paper needs Decaf
-        words = [*words[1:], *configured, "-n", "--cores", "2"]
+        words = ["-n", "--cores", "2", *words[1:], *configured]
         done = imported.snakemake(words, where, ENVIRONMENT | {"PYTHONPATH": str(where)})
     assert done.returncode == 0, (done.stdout + done.stderr)[-2000:]
     return done.stdout + done.stderr
@@ -231,6 +232,12 @@ def test_the_tutorial_changes_one_thing(project, tmp_path) -> None:
     config.write_text(config.read_text().replace("variants:\n", "variants:\n" + variant, 1))
     subprocess.run(["bash", "-c", row], cwd=tmp_path, check=True)
     assert jobs() == {rule: count + 1 for rule, count in before.items()} and len(before) == 3
+
+
+def test_the_pictures_of_the_documents_need_the_camera_that_is_held_out(folder, project) -> None:
+    words = ["snakemake", *WANTED[:-1], str(ROOT / WANTED[-1]), "--config", f"data_root={folder / 'captures/S2'}"]
+    said = planned(words, project)
+    assert re.search(r"^train +1$", said, re.M) and re.search(rf"^crop +{len(CAMERAS)}$", said, re.M)
 
 
 def test_the_pictures_of_the_documents_are_drawn(folder) -> None:

@@ -183,7 +183,7 @@ def _imported(folders: tuple[str, ...]) -> set[str]:
                 elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
                     if getattr(node.func, "id", getattr(node.func, "attr", "")) in ("require", "importorskip"):
                         names.add(str(node.args[0].value).partition(".")[0])
-    ours = {"nbavatar", "tests", "install", "makehuman", "collapse", "tiny", "build_synthetic_assets"}
+    ours = {"nbavatar", "tests", "tools", "install", "makehuman", "collapse", "tiny", "build_synthetic_assets"}
     return {name for name in names if name not in sys.stdlib_module_names} - ours
 
 
