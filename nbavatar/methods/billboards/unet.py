@@ -16,6 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from nbavatar.methods.billboards.convolution import Convolution
+
 __all__ = ["FORMS", "UNet", "macs", "normalised_picture"]
 
 FORMS = ("paper", "lean")
@@ -55,7 +57,9 @@ def _stage(channels_in: int, channels_out: int, *, stride: int = 1, norm: bool =
     for index in range(convs):
         first = index == 0
         layers.append(
-            nn.Conv2d(channels_in if first else channels_out, channels_out, 3, stride if first else 1, 1, bias=not norm)
+            Convolution(
+                channels_in if first else channels_out, channels_out, stride=stride if first else 1, bias=not norm
+            )
         )
         if norm:
             layers.append(_Norm(channels_out, affine=True))
