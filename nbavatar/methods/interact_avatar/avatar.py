@@ -157,7 +157,7 @@ class InteractAvatar(BoundGaussians):
         codes = [self.origin.new_zeros(posture.components) for posture in self.postures.values()]
         for i, (part, posture) in enumerate(self.postures.items()):
             if part in there:
-                codes[i] = posture.describe(there[part])[0].to(self.origin)
+                codes[i] = posture.describe(there[part]).to(self.origin)
         return InteractAnchor(bound, tuple(codes), *self._touches(bound, there))
 
     def _touches(self, bound: BoundAnchor, there: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -48,19 +48,18 @@ class Posture(nn.Module):
         return len(self.basis)
 
     @torch.no_grad()
-    def describe(self, verts: Tensor) -> tuple[Tensor, Tensor]:
-        """A posed part.
+    def describe(self, verts: Tensor) -> Tensor:
+        """The pose of a part, unchanged by rigid motions of it, up to rounding.
 
         Args:
             verts: vertices (V, 3) [m], finite.
 
         Returns:
-            its pose (K,), in the largest projection of the training and within 2 of it; the vertices, laid onto the
-            rest pose by a rigid motion, (V, 3) [m]. Both unchanged by rigid motions of the vertices, up to rounding.
+            projections (K,), in units of the largest one in training and within 2 of them.
         """
-        laid, _ = self.laid(verts)
-        found = torch.einsum("kvi,vi->k", self.basis, laid - self.rest - self.mean) / self.scale
-        return found.clamp(-_FARTHEST, _FARTHEST), laid
+        moved = self.laid(verts)[0] - self.rest - self.mean
+        found = torch.einsum("kvi,vi->k", self.basis, moved) / self.scale
+        return found.clamp(-_FARTHEST, _FARTHEST)
 
     @torch.no_grad()
     def laid(self, verts: Tensor, *others: Tensor) -> tuple[Tensor, list[Tensor]]:

@@ -111,9 +111,7 @@ def test_a_part_that_a_frame_lacks_is_as_if_it_were_not_there(lost, how) -> None
     assert bool((anchor.touch > 0).any()) == ("head" not in lost and len(lost) == 1)
     for part, code in zip(avatar.postures, anchor.codes, strict=True):
         assert (
-            bool((code == 0).all())
-            if part in lost
-            else torch.equal(code, avatar.postures[part].describe(verts[part])[0])
+            bool((code == 0).all()) if part in lost else torch.equal(code, avatar.postures[part].describe(verts[part]))
         )
     image = picture(avatar, given)[0]
     assert torch.equal(image, picture(avatar, there)[0]) and torch.isfinite(image).all()
