@@ -100,7 +100,7 @@ class Viewer:
         finally:
             long.cancel()
         spent = time.perf_counter() - began
-        tab.show(drawn, spent, work.whole)
+        tab.show(drawn, work.request.frame, spent, work.whole)
 
     def _failed(self, client: int, error: Exception) -> None:
         tab = self._tabs.get(client)
@@ -129,6 +129,7 @@ class _Tab:
         self._viewer, self._client = viewer, client
         self._closed = threading.Event()
         self._held: _Held | None = None
+        self._asking = threading.RLock()
         self._build()
         client.camera.on_update(lambda _: self._looked())
         threading.Thread(target=self._play, name="play", daemon=True).start()
@@ -168,8 +169,8 @@ class _Tab:
         """Text above the controls."""
         self._status.content = text
 
-    def show(self, drawn: Drawn, spent: float, whole: bool) -> None:
-        """Puts a picture on the canvas, and how it was made above the controls."""
+    def show(self, drawn: Drawn, frame: str, spent: float, whole: bool) -> None:
+        """Puts a picture of a frame on the canvas, and how it was made above the controls."""
         if self._closed.is_set():
             return
         self._client.scene.set_background_image(drawn.image, format="jpeg", jpeg_quality=90 if whole else 70)
@@ -178,8 +179,7 @@ class _Tab:
         width, height = drawn.size
         line = f"**{width} x {height} px**{state}, **{1000 * spent:.0f} ms**, {rate:.1f} pictures a second"
         decoder = [f"decoded by {' and '.join(drawn.decoders)}"] if drawn.decoders else []
-        frame = f"frame {self._viewer.scene.frames[self._row()]}"
-        self.say("  \n".join([line, *decoder, frame, *drawn.remarks]))
+        self.say("  \n".join([line, *decoder, f"frame {frame}", *drawn.remarks]))
 
     def _row(self) -> int:
         return min(int(self._frame.value), len(self._viewer.scene.frames) - 1)
@@ -199,21 +199,26 @@ class _Tab:
         return Eye(K, pose, own_width, own_height, free.aspect, name)
 
     def _ask(self) -> None:
-        eye = self._eye()
-        if eye is None or self._closed.is_set():
-            return
-        second = self._second.value
-        request = Request(
-            eye,
-            self._viewer.scene.frames[self._row()],
-            self._first.value,
-            "" if second == _NOTHING else second,
-            float(self._wipe.value),
-            self._what.value,
-            self._preset.value,
-            tuple(value / 255.0 for value in self._background.value),  # type: ignore[arg-type]
-        )
-        self._viewer.submit(self._client.client_id, request, int(self._side.value))
+        """Asks for the picture of what the controls say now.
+
+        viser calls from several threads: reading the controls and asking are one, or an older state could come last.
+        """
+        with self._asking:
+            eye = self._eye()
+            if eye is None or self._closed.is_set():
+                return
+            second = self._second.value
+            request = Request(
+                eye,
+                self._viewer.scene.frames[self._row()],
+                self._first.value,
+                "" if second == _NOTHING else second,
+                float(self._wipe.value),
+                self._what.value,
+                self._preset.value,
+                tuple(value / 255.0 for value in self._background.value),  # type: ignore[arg-type]
+            )
+            self._viewer.submit(self._client.client_id, request, int(self._side.value))
 
     def _looked(self) -> None:
         """The browser's camera has moved: a chosen camera of the capture is left, unless it is only arrived at."""

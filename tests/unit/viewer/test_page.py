@@ -1,6 +1,8 @@
 """The viewer in a real browser: it loads, turning and the frame slider change the picture, nothing complains."""
 
 import io
+import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from PIL import Image
 
 from nbavatar.cli import main, view
 from nbavatar.methods.storage import save_avatar
-from nbavatar.viewer.page import Viewer
+from nbavatar.viewer.page import Viewer, _Tab
 from tests.browser import Browser, find_browser
 from tests.scenes.toy import write_scene
 from tests.unit.methods.billboards.test_model import make_avatar
@@ -97,6 +99,37 @@ def test_the_page_turns_and_plays(viewer, browser) -> None:
     name = "torch" if engine is None else engine.name
     browser.wait(lambda: f"decoded by {name}" in browser.text(), "the name of what decodes")
     assert browser.console == []
+
+
+def test_the_last_picture_that_is_asked_for_is_of_the_latest_state(monkeypatch) -> None:
+    """One thread has read the controls and is held up, while another one reads and asks."""
+    tab, asked, second_is_done = object.__new__(_Tab), [], threading.Event()
+    states, reading = iter(["old", "new"]), threading.Event()
+
+    def eye(_):
+        state = next(states)
+        reading.set()
+        if state == "old":
+            second_is_done.wait(0.5)
+        return state
+
+    monkeypatch.setattr(_Tab, "_eye", eye)
+    for name, value in (
+        ("frame", 0), ("first", "full"), ("second", "nothing"), ("wipe", 0.5), ("what", "render"), ("preset", "exact"),
+        ("background", (255, 255, 255)), ("side", 64),
+    ):  # fmt: skip
+        setattr(tab, f"_{name}", SimpleNamespace(value=value))
+    tab._asking, tab._closed, tab._client = threading.RLock(), threading.Event(), SimpleNamespace(client_id=1)
+    scene = SimpleNamespace(frames=["f0"])
+    tab._viewer = SimpleNamespace(scene=scene, submit=lambda client, request, side: asked.append(request.eye))
+    first = threading.Thread(target=tab._ask)
+    first.start()
+    assert reading.wait(30)
+    second = threading.Thread(target=lambda: (tab._ask(), second_is_done.set()))
+    second.start()
+    first.join(30)
+    second.join(30)
+    assert asked == ["old", "new"]
 
 
 def test_what_is_not_there_to_view_is_one_line(tmp_path, capsys) -> None:
