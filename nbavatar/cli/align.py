@@ -1,17 +1,22 @@
-"""Rigid alignment of a capture's meshes to its pictures: takes a tracker's jitter out, frame by frame.
+"""Alignment of a capture's meshes to its pictures: takes a tracker's jitter out, frame by frame.
 
 Reads
   --meshes   mesh sequence (.npz, `nbavatar tracks`) with camera.<camera>.{K, cam_from_world, distortion, size}
   --frames   frame packs (.zip, `nbavatar ingest`) of the cameras to use, layer rgb, as recorded; a camera held out for
              evaluation is left out here and so never looked at
+  --masks    frame packs (.zip, `nbavatar masks`) of the same cameras, layers label and alpha, as recorded: with the
+             option `modes`, outlines draw the meshes too
 and writes
   --out      the mesh sequence with every part moved as a whole in every frame, and its extras head_rigid and head_final
              with the head; new extras align.<part> float32 [N, 6] (rotation vector about the part's mean [rad],
-             shift [m]), zero where nothing was done
+             shift [m]), zero where nothing was done; what bends a part is in its vertices only
 
-A part has to keep its colours while it moves a little, and to be seen in two frames or more. Errors that all frames
-share stay. Deformation stays too: use the contact stage and the training's `refine` for that. With
-{"frames": "train"} frames held out for self-reenactment keep the meshes they came with.
+With {"modes": 12} parts are bent too, by smooth functions on their surface, to where colours and the outlines of the
+masks agree: the error of a fit that no motion as a whole takes out. Errors that all frames share are seen by outlines
+only; without masks, and without `modes`, they stay. With {"frames": "train"} frames held out for self-reenactment keep
+the meshes they came with.
+
+A part has to keep its colours while it moves a little, and to be seen in two frames or more.
 """
 
 import argparse
@@ -25,9 +30,10 @@ from nbavatar.camera.pinhole import Camera, project
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.geometry import AlignConfig
-from nbavatar.data.sequences import MeshSequence, Part, read_sequence, write_sequence
-from nbavatar.errors import DataError
+from nbavatar.data.sequences import PARTS, MeshSequence, Part, read_sequence, write_sequence
+from nbavatar.errors import ConfigError, DataError
 from nbavatar.fitting.align import Motion, align_block, blocks, moved, summary
+from nbavatar.fitting.bend import bend_block, smooth_basis
 from nbavatar.io.framepack import FramePack
 from nbavatar.provenance import run_record
 
@@ -38,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the options."""
     parser.add_argument("--meshes", required=True, metavar="NPZ", help="mesh sequence of `nbavatar tracks`")
     parser.add_argument("--frames", nargs="+", required=True, metavar="ZIP", help="frame packs of the cameras to use")
+    parser.add_argument("--masks", nargs="*", default=[], metavar="ZIP", help="masks of the same cameras, for `modes`")
     parser.add_argument("--out", required=True, metavar="NPZ", help="aligned mesh sequence to write")
     add_cfg_argument(parser, AlignConfig)
 
@@ -67,22 +74,76 @@ def main(args: argparse.Namespace) -> None:
             for part, motion in align_block(verts, faces, cameras, read, cfg).items():
                 found[part][rows] = np.concatenate([motion.turn, motion.shift], axis=1)
                 motions[part].append(motion)
-    compared = {part: any(np.isfinite(motion.before) for motion in done) for part, done in motions.items() if done}
-    if compared and not any(compared.values()):
-        raise _nothing_to_compare(args.meshes, sequence, cameras)
-    for part in (part for part, seen in compared.items() if not seen):
-        print(f"{part}: no vertex is seen in two frames or more: there is nothing to compare, and it stays as it came")
-    report = {part: summary(done) for part, done in motions.items() if done}
-    for part, said in report.items():
-        shift, turn = said["shift_mm"], said["turn_deg"]
-        print(
-            f"{part}: moved {shift[0]:.2f} mm (up to {shift[1]:.2f}), turned {turn[0]:.2f} degrees "
-            f"(up to {turn[1]:.2f})"
-        )
-    aligned = _moved_sequence(sequence, found)
+        compared = {part: any(np.isfinite(motion.before) for motion in done) for part, done in motions.items() if done}
+        if compared and not any(compared.values()):
+            raise _nothing_to_compare(args.meshes, sequence, cameras)
+        for part in (part for part, seen in compared.items() if not seen):
+            print(
+                f"{part}: no vertex is seen in two frames or more: there is nothing to compare, and it stays as it came"
+            )
+        report = {part: summary(done) for part, done in motions.items() if done}
+        for part, said in report.items():
+            shift, turn = said["shift_mm"], said["turn_deg"]
+            print(
+                f"{part}: moved {shift[0]:.2f} mm (up to {shift[1]:.2f}), turned {turn[0]:.2f} degrees "
+                f"(up to {turn[1]:.2f})"
+            )
+        aligned = _moved_sequence(sequence, found)
+        if cfg.modes > 0 and pieces:
+            masks = {
+                str(p.manifest["camera"]): p for p in (stack.enter_context(FramePack(path)) for path in args.masks)
+            }
+            if args.masks and set(masks) != set(packs):
+                raise ConfigError.of("--masks", expected=f"masks of {', '.join(packs)}", found=", ".join(masks))
+            aligned, bent = _bent_sequence(aligned, pieces, cameras, packs, masks, cfg)
+            for part, (typical, most) in bent.items():
+                report.setdefault(part, {})["bend_mm"] = [typical, most]
+                print(f"{part}: bent by {typical:.2f} mm (up to {most:.2f})")
     inputs = {"meshes": args.meshes} | {f"frames.{i}": path for i, path in enumerate(args.frames)}
+    inputs |= {f"masks.{i}": path for i, path in enumerate(args.masks)}
     record = run_record("align", config=to_mapping(cfg), inputs=inputs, extra={"align": report})
     write_sequence(args.out, aligned, record)
+
+
+def _bent_sequence(
+    sequence: MeshSequence, pieces: list[list[int]], cameras: list[Camera], packs: dict[str, FramePack],
+    masks: dict[str, FramePack], cfg: AlignConfig,
+) -> tuple[MeshSequence, dict[str, tuple[float, float]]]:  # fmt: skip
+    """The sequence with its parts bent, and by how much each was: typical and largest distance [mm]."""
+    parts = {name: part for name, part in sequence.parts.items() if name in PARTS}
+    basis = {name: smooth_basis(part.rest, part.faces, cfg.modes) for name, part in parts.items()}
+    verts = {name: np.array(part.verts) for name, part in parts.items()}
+    labels = {name: PARTS.index(name) + 1 for name in parts}
+    faces, rest = {n: p.faces for n, p in parts.items()}, {n: p.rest for n, p in parts.items()}
+    known = {name: set(pack.frames) for name, pack in packs.items()}
+    masked = {name: set(pack.frames) for name, pack in masks.items()}
+    for rows in progress(pieces, "bend", len(pieces)):
+        names = [sequence.frames[row] for row in rows]
+
+        def read(camera: str, i: int, names: list[str] = names) -> np.ndarray | None:
+            return packs[camera].read("rgb", names[i]) if names[i] in known[camera] else None
+
+        def mask(camera: str, i: int, names: list[str] = names) -> tuple[np.ndarray, np.ndarray] | None:
+            if names[i] not in masked.get(camera, ()):
+                return None
+            return masks[camera].read("label", names[i]), masks[camera].read("alpha", names[i])
+
+        block = {name: values[rows] for name, values in verts.items()}
+        for name, values in bend_block(block, faces, rest, basis, labels, cameras, read, mask, cfg).items():
+            verts[name][rows] = values
+    extras = dict(sequence.extras)
+    bent: dict[str, tuple[float, float]] = {}
+    result = dict(sequence.parts)
+    for name, part in parts.items():
+        change = verts[name].astype(np.float64) - part.verts
+        far = 1e3 * np.linalg.norm(change[np.isfinite(change).all((1, 2))], axis=-1)
+        bent[name] = (round(float(np.median(far)), 4), round(float(far.max()), 4)) if far.size else (0.0, 0.0)
+        result[name] = Part(part.faces, part.rest, verts[name])
+        if name == "head":
+            for key in ("head_rigid", "head_final"):
+                if key in extras:
+                    extras[key] = (np.asarray(extras[key]) + change).astype(np.float32)
+    return MeshSequence(sequence.frames, result, extras), bent
 
 
 def _rows(sequence: MeshSequence, cfg: AlignConfig) -> list[int]:

@@ -57,7 +57,7 @@ class FitConfig:
 
 @dataclasses.dataclass(frozen=True)
 class AlignConfig:
-    """Rigid alignment of a capture's meshes to its pictures, frame by frame."""
+    """Alignment of a capture's meshes to its pictures, frame by frame: as a whole, then by smooth bending."""
 
     iterations: int = option(0, "Steps on each of two scales of detail; 0 leaves the stage out.", min=0, max=100)
     frames: str = option(
@@ -68,6 +68,10 @@ class AlignConfig:
     )
     shift_mm: float = option(5.0, "Shifts that are expected, about [mm].", min=1.0e-3)
     turn_deg: float = option(3.0, "Turns that are expected, about [degrees].", min=1.0e-3)
+    modes: int = option(
+        0, "Smooth functions on a part by which it is bent besides; 0 leaves it as it is but moved.", min=0, max=64
+    )
+    bend_mm: float = option(0.06, "Bending by each of them that is expected, about [mm].", min=1.0e-4)
     block: int = option(32, "Most frames that are aligned together; bounds the memory.", min=2)
     lines: int = option(512, "Height to which larger pictures are reduced [px].", min=16, max=2160)
     points: int = option(4000, "Most vertices of a part that are looked at.", min=3)

@@ -52,6 +52,11 @@ if PLAN.aligned:
             frames=lambda w: files(
                 rules.ingest.output, units.training_views(PLAN, w.subject)
             ),
+            masks=lambda w: (
+                files(rules.masks.output, units.training_views(PLAN, w.subject))
+                if RUN.stages.align.modes
+                else []
+            ),
         output:
             "results/{run}/align/{subject}.npz",
         log:
@@ -66,8 +71,8 @@ if PLAN.aligned:
             cfg=options("align"),
             code=code_digest("align"),
         shell:
-            "nbavatar align --meshes {input.meshes:q} --frames {input.frames:q} --out {output:q}"
-            " --cfg {params.cfg:q} > {log:q} 2>&1"
+            "nbavatar align --meshes {input.meshes:q} --frames {input.frames:q} --masks {input.masks:q}"
+            " --out {output:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 if PLAN.shelled:

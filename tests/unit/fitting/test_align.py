@@ -15,7 +15,8 @@ from nbavatar.cli import align as verb
 from nbavatar.config.geometry import AlignConfig
 from nbavatar.data.sequences import MeshSequence, Part, read_sequence, write_sequence
 from nbavatar.errors import DataError
-from nbavatar.fitting.align import Motion, _projected, _Shot, align_block, blocks, moved
+from nbavatar.fitting.align import Motion, align_block, blocks, moved
+from nbavatar.fitting.details import Details, projected
 from nbavatar.io.framepack import FramePackWriter
 from nbavatar.mesh.zbuffer import rasterize_mesh
 
@@ -116,14 +117,14 @@ def test_nothing_to_see_moves_nothing(scene: Scene) -> None:
 @pytest.mark.parametrize("distortion", [None, np.array([-0.12, 0.05, 1e-3, -2e-3, 0.0])])
 def test_projection_and_its_slope(distortion: np.ndarray | None) -> None:
     camera = _camera("a", 20, distortion)
-    shot = _Shot(camera, np.zeros((1, 80, 80, 3), np.float16), 0.5)
+    shot = Details(camera, np.zeros((1, 80, 80, 3), np.float16), 0.5)
     points = np.random.default_rng(0).uniform(-0.08, 0.08, size=(1, 50, 3))
-    pixels, slope = _projected(points, shot)
+    pixels, slope = projected(points, shot)
     if distortion is None:
         np.testing.assert_allclose(pixels, 0.5 * project(points, camera.K, camera.cam_from_world)[0], atol=1e-12)
     for axis in range(3):
         step = 1e-6 * np.eye(3)[axis]
-        numeric = (_projected(points + step, shot)[0] - _projected(points - step, shot)[0]) / 2e-6
+        numeric = (projected(points + step, shot)[0] - projected(points - step, shot)[0]) / 2e-6
         # The slope leaves the lens out: exact without one, within the lens' stretch otherwise.
         np.testing.assert_allclose(slope[..., axis], numeric, atol=1e-4 if distortion is None else 40.0)
 

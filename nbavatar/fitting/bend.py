@@ -1,0 +1,208 @@
+"""Smooth bending of tracked meshes to what the cameras saw: the error of a fit that no rigid motion takes out.
+
+Shapes and expressions of a fit are off by smooth fields: in a test of noisy fits, 12 smooth functions on the surface
+held three quarters of what a rigid motion had left. Each part of each frame is therefore moved by
+
+    x' = R_t (x + Q_t sum over k of b_k(x) c_tk) + d_t
+
+with b_k the lowest eigenfunctions of the surface's Laplacian (root mean square 1), Q_t the part's orientation in the
+frame, and rotation, shift and the coefficients c found together, by Gauss-Newton steps, coarse to fine. Three terms
+draw at the vertices: their colours (`nbavatar.fitting.details`), the outlines of the masks (`nbavatar.fitting.outline`)
+and a prior that keeps the coefficients small. Outlines see what all frames share; colours do not, so without outlines
+the coefficients of a run of frames have mean zero.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from nbavatar.camera.pinhole import Camera
+from nbavatar.config.geometry import AlignConfig
+from nbavatar.fitting.align import STILL, Motion, composed, cross_matrix, moved, spread
+from nbavatar.fitting.details import Details, Pulls, colour_pulls, likeness, look, projected
+from nbavatar.fitting.outline import Rim, rims_of
+from nbavatar.mesh.spectral import spectral_coordinates
+
+__all__ = ["bend_block", "smooth_basis"]
+
+_COLOUR = 0.1  # weight of a vertex' colour: about ten neighbours see the same detail
+_TYPICAL = (0.1, 0.5)  # typical distances of outlines beyond these are not believed: hair is no error of a fit [px]
+_ROBUST = 2.5  # distances from an outline of this many typical ones lose three quarters of their weight
+_STRIDE = 5e-4  # a step moves the vertices of a frame by no more, root mean square [m]
+
+
+class _Field(NamedTuple):
+    """How a part is moved: rigid motion and coefficients (n, K, 3) in its own axes [m]."""
+
+    motion: Motion
+    bend: np.ndarray
+
+
+class _Part(NamedTuple):
+    """What stays: vertices (n, V, 3), their mean (n, 3), orientation (n, 3, 3), basis (V, K), those looked at (P,)."""
+
+    verts: np.ndarray
+    centre: np.ndarray
+    turn: np.ndarray
+    basis: np.ndarray
+    chosen: np.ndarray
+
+    def placed(self, field: _Field, which: np.ndarray | slice) -> np.ndarray:
+        """Vertices after a field, (n, ..., 3) [m]."""
+        bent = np.einsum("nij,nvj->nvi", self.turn, self.basis[which] @ field.bend)
+        return moved(self.verts[:, which] + bent, field.motion, self.centre)
+
+
+def smooth_basis(rest: np.ndarray, faces: np.ndarray, modes: int) -> np.ndarray:
+    """The lowest non-constant eigenfunctions of a surface, each of root mean square 1, float64 (V, K)."""
+    basis = spectral_coordinates(np.asarray(rest, np.float64), faces, modes).coords.astype(np.float64)
+    size = np.sqrt((basis**2).mean(0))
+    return basis[:, size > 0] / size[size > 0]
+
+
+def bend_block(
+    verts: Mapping[str, np.ndarray],
+    faces: Mapping[str, np.ndarray],
+    rest: Mapping[str, np.ndarray],
+    basis: Mapping[str, np.ndarray],
+    labels: Mapping[str, int],
+    cameras: Sequence[Camera],
+    read: Callable[[str, int], np.ndarray | None],
+    masks: Callable[[str, int], tuple[np.ndarray, np.ndarray] | None],
+    cfg: AlignConfig,
+) -> dict[str, np.ndarray]:
+    """Bends all parts in a block of frames.
+
+    Args:
+        verts: part -> (n, V, 3) [m], world, aligned as a whole; NaN where the part is not in the frame.
+        faces: part -> (F, 3).
+        rest: part -> (V, 3) [m].
+        basis: part -> (V, K), `smooth_basis`.
+        labels: part -> its label in the masks.
+        cameras: that saw it.
+        read: picture of a camera (its name) in a frame of the block (its position), uint8 (H, W, 3), or None.
+        masks: labels and coverage likewise, uint8 (H, W) each, or None.
+        cfg: options.
+
+    Returns:
+        part -> vertices, float64 (n, V, 3) [m]; as they came where nothing is seen of the part.
+    """
+    seen, levels = look(verts, faces, cameras, read, cfg)
+    current = {part: points.astype(np.float64) for part, points in verts.items()}
+    fields: dict[str, _Field] = {}
+    parts: dict[str, _Part] = {}
+    for shots in levels:
+        rims = rims_of(current, faces, labels, cameras, masks, cfg)
+        for part, points in verts.items():
+            there = np.array([bool(np.isfinite(one).all()) for one in points])
+            if not there.any() or not (seen[part].any() or rims[part]):
+                continue
+            if part not in parts:
+                parts[part] = _prepared(points, there, rest[part], basis[part], cfg)
+                fields[part] = _still(len(points), parts[part].basis.shape[1])
+            weight = seen[part][..., parts[part].chosen] & there[None, :, None]
+            fields[part] = _bent(parts[part], fields[part], there, weight, rims[part], shots, cfg)
+            moved_part = parts[part].placed(fields[part], slice(None))
+            current[part] = np.where(there[:, None, None], moved_part, np.nan)
+    return current
+
+
+def _still(count: int, modes: int) -> _Field:
+    nothing = np.zeros((count, 3))
+    return _Field(Motion(nothing, nothing, np.nan, np.nan), np.zeros((count, modes, 3)))
+
+
+def _prepared(points: np.ndarray, there: np.ndarray, rest: np.ndarray, basis: np.ndarray, cfg: AlignConfig) -> _Part:
+    from scipy.spatial.transform import Rotation
+
+    start = np.where(there[:, None, None], points, 0.0).astype(np.float64)
+    flat = np.asarray(rest, np.float64) - rest.mean(0)
+    turn = np.tile(np.eye(3), (len(start), 1, 1))
+    for row in np.flatnonzero(there):
+        turn[row] = Rotation.align_vectors(start[row] - start[row].mean(0), flat)[0].as_matrix()
+    return _Part(start, start.mean(1), turn, basis, spread(points.shape[1], cfg.points))
+
+
+def _bent(
+    part: _Part, field: _Field, there: np.ndarray, weight: np.ndarray, rims: Sequence[Rim], shots: Sequence[Details],
+    cfg: AlignConfig,
+) -> _Field:  # fmt: skip
+    """Steps on one scale of detail."""
+    count, modes = field.bend.shape[:2]
+    alike = likeness(part.verts[:, part.chosen], 1e-3 * cfg.likeness_mm) * (there[:, None] & there)
+    rigid = np.repeat([np.radians(cfg.turn_deg) ** -2.0, (1e-3 * cfg.shift_mm) ** -2.0], 3)
+    prior = np.concatenate([rigid, np.full(3 * modes, (1e-3 * cfg.bend_mm) ** -2.0)])
+    for _ in range(cfg.iterations):
+        matrix, vector = _equations(part, field, weight, rims, shots, alike)
+        so_far = np.concatenate([field.motion.turn, field.motion.shift, field.bend.reshape(count, -1)], axis=1)
+        step = -np.linalg.solve(matrix + np.diag(prior), (vector + prior * so_far)[..., None])[..., 0]
+        step[~there] = 0.0
+        if not rims:
+            step[there] -= step[there].mean(0)
+        motion = Motion(composed(step[:, :3], field.motion.turn), field.motion.shift + step[:, 3:6], np.nan, np.nan)
+        field = _Field(motion, field.bend + step[:, 6:].reshape(count, modes, 3))
+        if np.abs(step[there, 3:]).mean() < STILL:
+            break
+    return field
+
+
+def _equations(
+    part: _Part, field: _Field, weight: np.ndarray, rims: Sequence[Rim], shots: Sequence[Details], alike: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of rotation, shift and coefficients of every frame: (n, 6 + 3K, 6 + 3K) and (n, 6 + 3K)."""
+    from scipy.spatial.transform import Rotation
+
+    count, modes = field.bend.shape[:2]
+    placed = part.placed(field, slice(None))
+    middle = part.centre + field.motion.shift
+    local = Rotation.from_rotvec(field.motion.turn).as_matrix() @ part.turn  # from the part's own axes to the world
+    colour = colour_pulls(placed[:, part.chosen], shots, weight, alike)
+    outline = _outline_pulls(placed, rims, shots)
+    size = 6 + 3 * modes
+    matrix, vector = np.zeros((count, size, size)), np.zeros((count, size))
+    for pulls, which, share in ((colour, part.chosen, _COLOUR), (outline, slice(None), 1.0)):
+        if pulls is None:
+            continue
+        arm = placed[:, which] - middle[:, None]
+        basis = part.basis[which]
+        for row in range(count):
+            told = np.flatnonzero(pulls.stiff[row].any((1, 2)))
+            if not len(told):
+                continue
+            stiff, pull, few = pulls.stiff[row, told], pulls.pull[row, told], basis[told]
+            swing = cross_matrix(-arm[row, told])
+            rigid = np.concatenate([swing, np.broadcast_to(np.eye(3), swing.shape)], axis=-1)  # (P, 3, 6)
+            axes = local[row]
+            stiff_rigid = stiff @ rigid
+            own = axes.T @ stiff @ axes
+            matrix[row, :6, :6] += share * np.einsum("vja,vjb->ab", rigid, stiff_rigid)
+            weighted = (few[:, :, None, None] * own[:, None]).reshape(len(few), -1)  # (P, K * 9)
+            both = (few.T @ weighted).reshape(modes, modes, 3, 3).transpose(0, 2, 1, 3)
+            matrix[row, 6:, 6:] += share * both.reshape(3 * modes, 3 * modes)
+            cross = (few.T @ (axes.T @ stiff_rigid).reshape(len(few), -1)).reshape(3 * modes, 6)
+            matrix[row, 6:, :6] += share * cross
+            matrix[row, :6, 6:] += share * cross.T
+            vector[row, :6] += share * np.einsum("vja,vj->a", rigid, pull)
+            vector[row, 6:] += share * (few.T @ (pull @ axes)).ravel()
+    return matrix, vector
+
+
+def _outline_pulls(placed: np.ndarray, rims: Sequence[Rim], shots: Sequence[Details]) -> Pulls | None:
+    """Where the outlines want the rim vertices to be."""
+    if not rims:
+        return None
+    slopes = [projected(placed, shot) for shot in shots]
+    told = []
+    for rim in rims:
+        pixels, slope = (values[rim.frame, rim.vertices] for values in slopes[rim.camera])
+        residual, change = rim.residual(pixels)
+        told.append((rim, residual, np.einsum("rp,rpx->rx", change, slope)))
+    typical = 1.4826 * float(np.median(np.abs(np.concatenate([residual for _, residual, _ in told]))))
+    typical = min(max(typical, _TYPICAL[0]), _TYPICAL[1])
+    stiff, pull = np.zeros((*placed.shape, 3)), np.zeros(placed.shape)
+    for rim, residual, change in told:
+        share = 1.0 / (1.0 + (residual / (_ROBUST * typical)) ** 2) ** 2 / typical**2
+        stiff[rim.frame, rim.vertices] += share[:, None, None] * change[:, :, None] * change[:, None, :]
+        pull[rim.frame, rim.vertices] += (share * residual)[:, None] * change
+    return Pulls(stiff, pull, typical)
