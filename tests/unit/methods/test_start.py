@@ -166,7 +166,7 @@ def test_an_avatar_of_the_same_meshes_is_taken_over_whole(scenes, config) -> Non
             {"unet"},
         ),
     ],
-    ids=str,
+    ids=["texels", "channels", "deferred", "unet"],
 )
 def test_billboards_of_other_sizes_keep_what_does_not_fit(scenes, change, left, fresh) -> None:
     other = trained(scenes["one"], BILLBOARDS)
