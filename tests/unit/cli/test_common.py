@@ -58,5 +58,5 @@ def test_bash_completes_verbs_options_and_choices(tmp_path, capsys) -> None:
 
     assert complete("nbavatar", "expo") == ["export"]
     assert complete("nbavatar", "export", "--to", "s") == ["splats"]
-    assert set(complete("nbavatar", "train", "--s")) == {"--set", "--spectral"}
+    assert set(complete("nbavatar", "train", "--s")) == {"--set", "--spectral", "--start"}
     assert set(whole_parser()._subparsers._group_actions[0].choices) == set(VERBS)

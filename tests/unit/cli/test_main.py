@@ -112,7 +112,19 @@ def test_an_input_is_not_replaced_by_a_result(tmp_path, capsys, link):
 READ = {
     *("assets", "camera", "cameras", "capture", "cfg", "evals", "extremes", "figures", "flame", "frames", "histories"),
     *("layout", "masks", "meshes", "model", "models", "photos", "pictures", "presets", "protocol", "render", "renders"),
-    *("reported", "sequences", "source", "spectral", "speeds", "supplied", "tables", "target", "tracks", "tradeoffs"),
+    *(
+        "reported",
+        "sequences",
+        "source",
+        "spectral",
+        "speeds",
+        "start",
+        "supplied",
+        "tables",
+        "target",
+        "tracks",
+        "tradeoffs",
+    ),
     *("train_frames", "videos"),
 }
 FILES = {"CSV", "EXR", "FILE", "HTML", "JSON", "JSONL", "JSON|FILE", "MP4", "NPZ", "PATH", "PKL", "PNG", "PT", "ZIP"}
