@@ -288,7 +288,7 @@ def _added(name):
 
 
 MASKED = {**CHECKED, "masks": 1, "crop": 1}
-# The alignment draws meshes to the outlines of the training cameras' masks, and what the head lacks is carved from them.
+# Meshes are drawn to the outlines of the training cameras' masks, and what the head lacks is carved from them.
 CARVED = {**MASKED, "align": 1, "shell": 1, "spectral": 1}
 SEEN = {**CHECKED, "ingest": 1, "masks": 1, "crop": 1}
 MOVED = {**CHECKED, **dict.fromkeys(("tracks", "masks", "crop", "align", "shell", "spectral"), ALL), **TRAINED}
