@@ -1,4 +1,6 @@
 """Billboards and U-Net of another avatar in place of the initial ones, part by part."""
+# pyright: reportArgumentType=false
+# Lists of names are read as lists of those they begin with.
 
 from collections.abc import Sequence
 

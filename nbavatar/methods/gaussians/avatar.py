@@ -143,7 +143,7 @@ class GaussianAvatar(MeshAvatar):
     def appearance(self, posed: PosedGaussians) -> tuple[Tensor, Tensor]:
         """Opacities in [0, 1] (M,) and harmonics (M, K, 3) of posed Gaussians."""
         own = posed.opacity_logit is None
-        opacity = torch.sigmoid(self.opacity_logit if own else posed.opacity_logit)
+        opacity = torch.sigmoid(self.opacity_logit if own else posed.opacity_logit)  # pyright: ignore[reportArgumentType]
         if own and posed.rows is not None:
             opacity = opacity[posed.rows]
         if posed.harmonics is not None:

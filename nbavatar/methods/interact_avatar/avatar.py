@@ -11,6 +11,8 @@ hand near it is GaussianAvatars'. The first guess of the contact's deformation i
 given. Parts that are not there are left out: without a hand, or without a head, there is nothing to interact. The
 choices that the publication leaves open are listed in docs/decisions/010-after-interactavatar.md.
 """
+# pyright: reportArgumentType=false
+# torch gives what a module holds by name as a tensor or a module; here they are postures.
 
 import math
 from collections.abc import Mapping, Sequence

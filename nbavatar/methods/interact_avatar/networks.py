@@ -2,6 +2,8 @@
 
 All are small perceptrons with ReLU. Networks of changes start at exactly zero: an untrained avatar is GaussianAvatars'.
 """
+# pyright: reportReturnType=false
+# torch says of skip_init that it gives a module, whatever class is asked for.
 
 import math
 
