@@ -7,7 +7,7 @@ import numpy as np
 from nbavatar.camera.distortion import distort_vertices
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.sequences import PARTS
-from nbavatar.mesh.zbuffer import rasterize_mesh
+from nbavatar.mesh.zbuffer import joined_meshes, rasterize_mesh
 from nbavatar.preprocess.overlay import mask_outline, shade
 
 __all__ = ["mesh_over_image"]
@@ -31,9 +31,8 @@ def mesh_over_image(
         strength: 0 shows the image only, 1 the mesh only.
     """
     names = [name for name in PARTS if name in meshes]
-    offsets = np.cumsum([0] + [len(meshes[name][0]) for name in names])
-    verts = np.concatenate([meshes[name][0] for name in names]).astype(np.float64)
-    faces = np.concatenate([meshes[name][1] + offset for name, offset in zip(names, offsets)])
+    verts, faces, _ = joined_meshes([meshes[name] for name in names])
+    verts = verts.astype(np.float64)
     part = np.concatenate([np.full(len(meshes[name][1]), PARTS.index(name) + 1, np.uint8) for name in names])
     points = verts @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], dtype=np.float64)

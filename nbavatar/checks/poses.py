@@ -17,7 +17,7 @@ from nbavatar.camera.distortion import distort_vertices
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
-from nbavatar.mesh.zbuffer import rasterize_mesh
+from nbavatar.mesh.zbuffer import joined_meshes, rasterize_mesh
 
 __all__ = ["PoseJudge", "sampled_frames"]
 
@@ -336,11 +336,9 @@ class PoseJudge:
         """The fit of a view; and, where masks are labels, part -> pixels that are met, and pixels."""
         mesh, (height, width) = self._meshes[view.frame], view.mask.shape
         names = [part for part in PARTS if part in mesh and part in self._topology]
-        offsets = np.cumsum([0] + [len(mesh[part]) for part in names])
-        faces = np.concatenate([self._topology[part][0] + offset for part, offset in zip(names, offsets)])
+        verts, faces, _ = joined_meshes([(mesh[part], self._topology[part][0]) for part in names])
         part = np.concatenate([np.full(len(self._topology[p][0]), PARTS.index(p) + 1) for p in names])
-        verts = np.concatenate([mesh[p] for p in names]).astype(np.float64)
-        points = verts @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        points = verts.astype(np.float64) @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
         if camera.distortion is not None:
             corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], dtype=np.float64)
             reach = np.linalg.norm((corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], axis=1).max()

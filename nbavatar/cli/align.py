@@ -21,6 +21,7 @@ A part has to keep its colours while it moves a little, and to be seen in two fr
 
 import argparse
 import contextlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -59,16 +60,11 @@ def main(args: argparse.Namespace) -> None:
     with contextlib.ExitStack() as stack:
         packs = {str(p.manifest["camera"]): p for p in (stack.enter_context(FramePack(path)) for path in args.frames)}
         cameras = [_camera(name, pack, sequence, args.meshes) for name, pack in packs.items()]
-        known = {name: set(pack.frames) for name, pack in packs.items()}
         cuts = np.asarray(sequence.extras.get("segments", [[0, count - 1]])).reshape(-1, 2)
         segments = [(int(first), int(last)) for first, last in cuts]
         pieces = blocks(_rows(sequence, cfg), segments, cfg.block) if cfg.iterations > 0 else []
         for rows in progress(pieces, "align", len(pieces)):
-            names = [sequence.frames[row] for row in rows]
-
-            def read(camera: str, i: int, names: list[str] = names) -> np.ndarray | None:
-                return packs[camera].read("rgb", names[i]) if names[i] in known[camera] else None
-
+            read = _reader(packs, "rgb", [sequence.frames[row] for row in rows])
             verts = {part: np.asarray(mesh.verts[rows]) for part, mesh in sequence.parts.items()}
             faces = {part: mesh.faces for part, mesh in sequence.parts.items()}
             for part, motion in align_block(verts, faces, cameras, read, cfg).items():
@@ -115,18 +111,13 @@ def _bent_sequence(
     verts = {name: np.array(part.verts) for name, part in parts.items()}
     labels = {name: PARTS.index(name) + 1 for name in parts}
     faces, rest = {n: p.faces for n, p in parts.items()}, {n: p.rest for n, p in parts.items()}
-    known = {name: set(pack.frames) for name, pack in packs.items()}
-    masked = {name: set(pack.frames) for name, pack in masks.items()}
     for rows in progress(pieces, "bend", len(pieces)):
         names = [sequence.frames[row] for row in rows]
+        read, label, alpha = (_reader(*of, names) for of in ((packs, "rgb"), (masks, "label"), (masks, "alpha")))
 
-        def read(camera: str, i: int, names: list[str] = names) -> np.ndarray | None:
-            return packs[camera].read("rgb", names[i]) if names[i] in known[camera] else None
-
-        def mask(camera: str, i: int, names: list[str] = names) -> tuple[np.ndarray, np.ndarray] | None:
-            if names[i] not in masked.get(camera, ()):
-                return None
-            return masks[camera].read("label", names[i]), masks[camera].read("alpha", names[i])
+        def mask(camera: str, i: int, label: Any = label, alpha: Any = alpha) -> tuple[np.ndarray, np.ndarray] | None:
+            shown, covered = label(camera, i), alpha(camera, i)
+            return None if shown is None or covered is None else (shown, covered)
 
         block = {name: values[rows] for name, values in verts.items()}
         for name, values in bend_block(block, faces, rest, basis, labels, cameras, read, mask, cfg).items():
@@ -144,6 +135,16 @@ def _bent_sequence(
                 if key in extras:
                     extras[key] = (np.asarray(extras[key]) + change).astype(np.float32)
     return MeshSequence(sequence.frames, result, extras), bent
+
+
+def _reader(packs: dict[str, FramePack], layer: str, names: list[str]) -> Callable[[str, int], np.ndarray | None]:
+    """Reads a layer of a camera (its name) in one of the frames `names` (its position); None where there is none."""
+    known = {camera: set(pack.frames) for camera, pack in packs.items()}
+
+    def read(camera: str, i: int) -> np.ndarray | None:
+        return packs[camera].read(layer, names[i]) if names[i] in known.get(camera, ()) else None
+
+    return read
 
 
 def _rows(sequence: MeshSequence, cfg: AlignConfig) -> list[int]:

@@ -38,7 +38,7 @@ class Stages:
     tracks: TracksConfig = option(TracksConfig, "Reading of parameters, keypoints and meshes.")
     masks: MasksConfig = option(MasksConfig, "Head and hand masks.")
     fit: FitConfig = option(FitConfig, "Multi-view refit.")
-    align: AlignConfig = option(AlignConfig, "Rigid alignment of a capture's meshes to its pictures.")
+    align: AlignConfig = option(AlignConfig, "Alignment of a capture's meshes to its pictures.")
     shell: ShellConfig = option(ShellConfig, "What the head's mesh of a capture lacks, such as hair.")
     spectral: SpectralConfig = option(SpectralConfig, "Spectral coordinates.")
     deform: DeformConfig = option(DeformConfig, "Contact deformation.")

@@ -14,7 +14,7 @@ from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import Camera, project, scale_intrinsics
 from nbavatar.config.geometry import AlignConfig
 from nbavatar.mesh.drawing import vertex_normals
-from nbavatar.mesh.zbuffer import rasterize_mesh
+from nbavatar.mesh.zbuffer import joined_meshes, rasterize_mesh
 
 __all__ = ["Details", "Pulls", "colour_pulls", "facing", "likeness", "look", "projected", "working_size"]
 
@@ -181,9 +181,7 @@ def _visible(
             there = [part for part in verts if np.isfinite(verts[part][row]).all()]
             if pictures[camera.name][row] is None or not there:
                 continue
-            offsets = np.cumsum([0, *(len(verts[part][row]) for part in there)])
-            merged = np.concatenate([verts[part][row] for part in there])
-            joined = np.concatenate([faces[part] + first for part, first in zip(there, offsets, strict=False)])
+            merged, joined, offsets = joined_meshes([(verts[part][row], faces[part]) for part in there])
             owner = np.repeat(np.arange(len(there)), [len(faces[part]) for part in there])
             face, _, depth = rasterize_mesh(merged, joined, K, width, height, cam_from_world=camera.cam_from_world)
             owners = np.where(face >= 0, owner[np.maximum(face, 0)], -1)

@@ -15,7 +15,7 @@ from nbavatar.camera.pinhole import Camera, project, scale_intrinsics
 from nbavatar.config.geometry import AlignConfig
 from nbavatar.fitting.details import facing, working_size
 from nbavatar.fitting.silhouette import signed_distance_map
-from nbavatar.mesh.zbuffer import rasterize_mesh
+from nbavatar.mesh.zbuffer import joined_meshes, rasterize_mesh
 
 __all__ = ["Rim", "rims_of"]
 
@@ -93,7 +93,8 @@ def rims_of(
             if given is None or not there:
                 continue
             label = cv2.resize(given[0], (width, height), interpolation=cv2.INTER_NEAREST)
-            drawn = _drawn(verts, faces, there, row, camera, K, width, height)
+            meshes = [(verts[part][row], faces[part]) for part in there]
+            drawn = _drawn(meshes, scale_intrinsics(K, _HALF, _HALF), camera, _HALF * width, _HALF * height)
             if not drawn.any() or drawn.all():
                 continue
             mesh, shown = signed_distance_map(drawn, 1 / _HALF), _shown(given[1], width, height)
@@ -119,17 +120,11 @@ def rims_of(
 
 
 def _drawn(
-    verts: Mapping[str, np.ndarray], faces: Mapping[str, np.ndarray], there: Sequence[str], row: int, camera: Camera,
-    K: np.ndarray, width: int, height: int,
-) -> np.ndarray:  # fmt: skip
-    """Where the meshes are in a picture of half pixels, bool."""
-    offsets = np.cumsum([0, *(len(verts[part][row]) for part in there)])
-    merged = np.concatenate([verts[part][row] for part in there])
-    joined = np.concatenate([faces[part] + first for part, first in zip(there, offsets, strict=False)])
-    fine = scale_intrinsics(K, _HALF, _HALF)
-    face, _, _ = rasterize_mesh(
-        merged, joined, fine, _HALF * width, _HALF * height, cam_from_world=camera.cam_from_world
-    )
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]], K: np.ndarray, camera: Camera, width: int, height: int
+) -> np.ndarray:
+    """Where meshes are in a picture with intrinsics K, bool (height, width)."""
+    merged, joined, _ = joined_meshes(meshes)
+    face, _, _ = rasterize_mesh(merged, joined, K, width, height, cam_from_world=camera.cam_from_world)
     return np.asarray(face >= 0)
 
 

@@ -13,13 +13,14 @@ tests.
 """
 
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from nbavatar.jit.cache import stored_njit
 
-__all__ = ["project_bounds", "rasterize_mesh"]
+__all__ = ["joined_meshes", "project_bounds", "rasterize_mesh"]
 
 
 @stored_njit(nogil=True)
@@ -102,6 +103,20 @@ def _all_bounds(verts, faces, k, near):
     for f in range(len(faces)):
         bounds[f, 0], bounds[f, 1], bounds[f, 2], bounds[f, 3] = project_bounds(verts, faces[f], k, near)
     return bounds
+
+
+def joined_meshes(meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Several meshes as one, to be drawn together.
+
+    Args:
+        meshes: vertices (V, 3) and faces (F, 3) of each, one at least.
+
+    Returns:
+        vertices, faces, and where the vertices of each begin, with the end of the last, int64 (n + 1,).
+    """
+    offsets = np.cumsum([0, *(len(verts) for verts, _ in meshes)])
+    faces = [faces + first for (_, faces), first in zip(meshes, offsets, strict=False)]
+    return np.concatenate([verts for verts, _ in meshes]), np.concatenate(faces), offsets
 
 
 def rasterize_mesh(

@@ -5,7 +5,6 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -18,20 +17,10 @@ from nbavatar.errors import DataError
 from nbavatar.fitting.align import Motion, align_block, blocks, moved
 from nbavatar.fitting.details import Details, projected
 from nbavatar.io.framepack import FramePackWriter
-from nbavatar.mesh.zbuffer import rasterize_mesh
+from tests.unit.fitting.ellipsoid import SIDE, camera_at, filmed, painted_ellipsoid
 
-SIDE = 160
 FRAMES = 8
 CONFIG = AlignConfig(iterations=6)
-
-
-def _camera(name: str, angle: float, distortion: np.ndarray | None = None) -> Camera:
-    """One on a circle of 0.6 m around the origin, looking at it."""
-    turn = Rotation.from_euler("y", angle, degrees=True).as_matrix()
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, [0, 0, 0.6]
-    K = np.array([[400.0, 0, 83.0], [0, 405.0, 77.0], [0, 0, 1]])
-    return Camera(name, SIDE, SIDE, K, pose, distortion)
 
 
 @dataclasses.dataclass
@@ -56,12 +45,7 @@ class Scene:
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     rng = np.random.default_rng(3)
-    sphere = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
-    rest, faces = np.asarray(sphere.vertices) * [0.07, 0.09, 0.08], np.asarray(sphere.faces)
-    # Paint: waves of a few millimetres to centimetres in all directions.
-    waves = rng.normal(size=(3, 24, 3)) * rng.uniform(60, 400, size=(3, 24, 1))
-    phase = rng.uniform(0, 2 * np.pi, size=(3, 24))
-    paint = 0.5 + 0.06 * np.stack([np.sin(rest @ w.T + p).sum(1) for w, p in zip(waves, phase, strict=True)], 1)
+    rest, faces, paint = painted_ellipsoid(rng)
     step = np.linspace(-1, 1, FRAMES)
     exact = np.stack(
         [
@@ -70,15 +54,9 @@ def scene() -> Scene:
         ]
     )
     jitter = Motion(np.radians(0.4) * rng.normal(size=(FRAMES, 3)), 1e-3 * rng.normal(size=(FRAMES, 3)), 0, 0)
-    cameras = [_camera("a", -35), _camera("b", 0), _camera("c", 40)]
-    pictures = {}
-    for camera in cameras:
-        pictures[camera.name] = []
-        for verts in exact:
-            face, weights, _ = rasterize_mesh(verts, faces, camera.K, SIDE, SIDE, cam_from_world=camera.cam_from_world)
-            colour = np.einsum("hwk,hwkc->hwc", weights, paint[faces[np.maximum(face, 0)]])
-            colour[face < 0] = 0.2
-            pictures[camera.name].append((colour.clip(0, 1) * 255 + 0.5).astype(np.uint8))
+    cameras = [camera_at("a", -35), camera_at("b", 0), camera_at("c", 40)]
+    shown = filmed(cameras, exact, faces, paint)
+    pictures = {camera.name: [shown[camera.name, row][0] for row in range(FRAMES)] for camera in cameras}
     return Scene(faces, exact, moved(exact, jitter), cameras, pictures)
 
 
@@ -116,7 +94,7 @@ def test_nothing_to_see_moves_nothing(scene: Scene) -> None:
 
 @pytest.mark.parametrize("distortion", [None, np.array([-0.12, 0.05, 1e-3, -2e-3, 0.0])])
 def test_projection_and_its_slope(distortion: np.ndarray | None) -> None:
-    camera = _camera("a", 20, distortion)
+    camera = camera_at("a", 20, distortion)
     shot = Details(camera, np.zeros((1, 80, 80, 3), np.float16), 0.5)
     points = np.random.default_rng(0).uniform(-0.08, 0.08, size=(1, 50, 3))
     pixels, slope = projected(points, shot)

@@ -5,10 +5,9 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.spatial.transform import Rotation
 
-from nbavatar.camera.pinhole import Camera, project
+from nbavatar.camera.pinhole import project
 from nbavatar.cli import align as verb
 from nbavatar.config.geometry import AlignConfig
 from nbavatar.data.sequences import MeshSequence, Part, read_sequence, write_sequence
@@ -19,17 +18,10 @@ from nbavatar.fitting.bend import bend_block, smooth_basis
 from nbavatar.fitting.details import look
 from nbavatar.fitting.outline import rims_of
 from nbavatar.io.framepack import FramePackWriter
-from nbavatar.mesh.zbuffer import rasterize_mesh
+from tests.unit.fitting.ellipsoid import SIDE, camera_at, filmed, painted_ellipsoid
 
-SIDE, FRAMES, MODES = 160, 6, 6
+FRAMES, MODES = 6, 6
 CONFIG = AlignConfig(iterations=6, modes=MODES, bend_mm=0.3)
-
-
-def _camera(name: str, angle: float) -> Camera:
-    """One on a circle of 0.6 m around the origin, looking at it."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("y", angle, degrees=True).as_matrix(), [0, 0, 0.6]
-    return Camera(name, SIDE, SIDE, np.array([[400.0, 0, 83.0], [0, 405.0, 77.0], [0, 0, 1]]), pose, None)
 
 
 class Scene:
@@ -37,12 +29,7 @@ class Scene:
 
     def __init__(self) -> None:
         rng = np.random.default_rng(3)
-        sphere = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
-        self.rest, self.faces = np.asarray(sphere.vertices) * [0.07, 0.09, 0.08], np.asarray(sphere.faces)
-        waves = rng.normal(size=(3, 24, 3)) * rng.uniform(60, 400, size=(3, 24, 1))
-        phase = rng.uniform(0, 2 * np.pi, size=(3, 24))
-        paint = [np.sin(self.rest @ w.T + p).sum(1) for w, p in zip(waves, phase, strict=True)]
-        colours = 0.5 + 0.06 * np.stack(paint, 1)
+        self.rest, self.faces, paint = painted_ellipsoid(rng)
         turns = [Rotation.from_euler("yx", [2 * t, t], degrees=True).as_matrix() for t in np.linspace(-1, 1, FRAMES)]
         self.exact = np.stack([self.rest @ turn.T for turn in turns])
         self.basis = smooth_basis(self.rest, self.faces, MODES)
@@ -51,24 +38,14 @@ class Scene:
         own = np.stack([self.basis @ (size * rng.normal(size=(MODES, 3))) for _ in turns])
         self.own = np.stack([field @ turn.T for field, turn in zip(own - own.mean(0), turns, strict=True)])
         self.noisy = self.exact + self.own + np.stack([self.shared @ turn.T for turn in turns])
-        self.cameras = [_camera("a", -50), _camera("b", 0), _camera("c", 55)]
-        self.pictures: dict[tuple[str, int], np.ndarray] = {}
-        self.alpha: dict[tuple[str, int], np.ndarray] = {}
-        for camera in self.cameras:
-            for row, verts in enumerate(self.exact):
-                face, weights, _ = rasterize_mesh(
-                    verts, self.faces, camera.K, SIDE, SIDE, cam_from_world=camera.cam_from_world
-                )
-                colour = np.einsum("hwk,hwkc->hwc", weights, colours[self.faces[np.maximum(face, 0)]])
-                colour[face < 0] = 0.2
-                self.pictures[camera.name, row] = (colour.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-                self.alpha[camera.name, row] = np.where(face >= 0, 255, 0).astype(np.uint8)
+        self.cameras = [camera_at("a", -50), camera_at("b", 0), camera_at("c", 55)]
+        self.shown = filmed(self.cameras, self.exact, self.faces, paint)
 
     def read(self, camera: str, row: int) -> np.ndarray:
-        return self.pictures[camera, row]
+        return self.shown[camera, row][0]
 
     def masks(self, camera: str, row: int) -> tuple[np.ndarray, np.ndarray]:
-        alpha = self.alpha[camera, row]
+        alpha = self.shown[camera, row][1]
         return (alpha > 0).astype(np.uint8), alpha
 
     def bent(self, noisy: np.ndarray, masks, cfg: AlignConfig = CONFIG) -> np.ndarray:
