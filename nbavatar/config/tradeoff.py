@@ -35,12 +35,6 @@ class SettingConfig:
     billboards: float = option(1.0, "Share of the billboards kept, those that contribute most.", min=0.01, max=1.0)
     mips: bool = option(False, "Take smaller textures where the avatar is small on screen.")
     channels_last: bool = option(True, "Memory layout of the U-Net: channels last, else channels first.")
-    norm: str = option(
-        "instance",
-        "How the U-Net normalises: torch's instance normalisation, or the same sums as a batch normalisation of the "
-        "one picture, which spares copies on a CPU.",
-        choices=("instance", "batch"),
-    )
     threads: int | None = option(None, "Threads of the CPU; null: as many as torch takes.", min=1, max=1024)
 
 

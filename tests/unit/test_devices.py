@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import platform
 import subprocess
 import sys
 import time
@@ -33,6 +34,31 @@ def test_cpu_is_given_when_asked_for_or_when_there_is_nothing_else(monkeypatch):
     for wanted in ("cpu", "auto"):
         with devices.lease_device(wanted) as device:
             assert device == "cpu"
+
+
+_FAULTS = """
+import resource
+from nbavatar.devices import lease_device
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    block = b"1" * (256 << 20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+with lease_device("cpu"):
+    print(faults(), faults())
+"""
+
+
+@pytest.mark.skipif(not platform.libc_ver()[0], reason="another C library than glibc")
+@pytest.mark.parametrize("setting", [{}, {"MALLOC_TOP_PAD_": "0"}, {"GLIBC_TUNABLES": "glibc.malloc.top_pad=0"}])
+def test_memory_is_used_again_without_a_page_fault(setting):
+    """The system clears the pages of a block once; where the user has tuned the C library it stays as it is."""
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "GLIBC_TUNABLES"))}
+    run = subprocess.run([sys.executable, "-c", _FAULTS], env=clean | setting, capture_output=True, text=True, check=True)
+    first, second = map(int, run.stdout.split())
+    assert first >= 128  # 256 MiB in pages of 2 MiB
+    assert second > first / 2 if setting else second < first / 10
 
 
 @pytest.mark.parametrize("hidden", ["", "-1", " -1 ", "-1,0", "NoDevFiles"])

@@ -100,7 +100,7 @@ class TunedAvatar:
         if setting.texels is not None:
             avatar = resize_textures(avatar, setting.texels)
         self.avatar = avatar
-        self._unet = prepared_unet(avatar.unet, channels_last=setting.channels_last, batch_norm=setting.norm == "batch")
+        self._unet = prepared_unet(avatar.unet, channels_last=setting.channels_last)
         self._scenes: dict[tuple[str, ...], _Scene] = {}
 
     @property

@@ -23,7 +23,6 @@ KNOBS = {
     "billboards": "Share of the billboards kept",
     "mips": "Textures by size on screen",
     "channels_last": "Memory layout of the U-Net",
-    "norm": "Normalisation in the U-Net",
     "threads": "Threads",
 }
 _SAME_SPEED = 0.03
