@@ -55,7 +55,8 @@ with lease_device("cpu"):
 def test_memory_is_used_again_without_a_page_fault(setting):
     """The system clears the pages of a block once; where the user has tuned the C library it stays as it is."""
     clean = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "GLIBC_TUNABLES"))}
-    run = subprocess.run([sys.executable, "-c", _FAULTS], env=clean | setting, capture_output=True, text=True, check=True)
+    words = [sys.executable, "-c", _FAULTS]
+    run = subprocess.run(words, env=clean | setting, capture_output=True, text=True, check=True)
     first, second = map(int, run.stdout.split())
     assert first >= 128  # 256 MiB in pages of 2 MiB
     assert second > first / 2 if setting else second < first / 10
