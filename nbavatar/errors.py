@@ -7,6 +7,7 @@ of ours and keeps its traceback.
 # provenance: neutral, because it words what goes wrong.
 
 import contextlib
+import errno
 import importlib
 import os
 import reprlib
@@ -27,6 +28,7 @@ __all__ = [
     "StorageError",
     "describe",
     "did_you_mean",
+    "limit_of",
     "parsing",
     "require",
 ]
@@ -119,9 +121,16 @@ def parsing(
         found = f"{damaged} ({_reason(cause)})"
         if isinstance(cause, OSError) and cause.strerror:
             found = f"one that cannot be read: {cause.strerror}"
+            fix = limit_of(cause) or fix
         elif _is_pointer(where):
             found, fix = "a pointer of Git LFS in its place", "fetch the file itself with: git lfs pull"
         raise error.of(where, field, expected=expected, found=found, fix=fix) from cause
+
+
+def limit_of(error: OSError) -> str:
+    """What to do about an error that a limit of the process explains; empty where none does."""
+    many = error.errno in (errno.EMFILE, errno.ENFILE)  # packs of all cameras of a stage are open at a time
+    return "raise the limit of open files (ulimit -n)" if many else ""
 
 
 def _special(where: object) -> str:

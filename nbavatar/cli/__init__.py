@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 
 from nbavatar import __version__
-from nbavatar.errors import ConfigError, NBAvatarError, describe, did_you_mean
+from nbavatar.errors import ConfigError, NBAvatarError, describe, did_you_mean, limit_of
 from nbavatar.packages import distribution_of, install_line
 from nbavatar.waiting import wait_briefly
 
@@ -142,7 +142,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         if error.errno is None or error.errno in _OURS:
             raise
-        message = f"{_place(error)}: {error.strerror}"
+        message = "; ".join(filter(None, (f"{_place(error)}: {error.strerror}", limit_of(error))))
     except MemoryError as error:
         message = f"out of memory: {error or 'the data are too large for this machine'}"
     print(f"nbavatar {verb}: error: {message}", file=sys.stderr)

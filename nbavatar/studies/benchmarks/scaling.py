@@ -8,6 +8,8 @@
     decoder.pixels                       the U-Net of the run's avatars, no gradients
     step.billboards, step.pixels         a training step of the run (`bench train --config`)
     frames                               a frame pack of 64 x 64 px written and read, by its frames
+    cameras                              the training views of cameras of eight frames of 64 x 64 px listed and decoded
+    align.cameras                        meshes of four frames moved and bent to pictures of 256 px, by the cameras
     subjects                             the units of work of the paper's tables planned, by the subjects
 
 Points are measured in turns, the smallest first, so that other programs disturb all of them alike. Figures of each:

@@ -1,5 +1,6 @@
 """The kinds of work that `nbavatar bench scaling` measures: each makes a call for a size."""
 
+import contextlib
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
@@ -8,10 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from nbavatar.camera.pinhole import Camera, facing_pose
+from nbavatar.config.geometry import AlignConfig
 from nbavatar.config.yamlfiles import read_yaml
-from nbavatar.data.sequences import MeshSequence, Part
+from nbavatar.data.sequences import PARTS, MeshSequence, Part
 from nbavatar.data.synthetic.scene import full_scene
+from nbavatar.data.views import ViewStore, shuffled, views_of
+from nbavatar.fitting.align import align_block
+from nbavatar.fitting.bend import bend_block, smooth_basis
 from nbavatar.io.framepack import FramePack, FramePackWriter
+from nbavatar.mesh.zbuffer import joined_meshes, rasterize_mesh
 from nbavatar.methods.billboards.unet import UNet
 from nbavatar.planning import units
 from nbavatar.planning.run import Plan, read_plan
@@ -23,6 +30,7 @@ __all__ = ["WORKS", "Work"]
 
 _SIDE = 256  # where billboards grow [px]
 _SMALL = 64  # of the frames of a pack [px]
+_FEW, _ALIGNED = 8, 4  # frames of a camera where cameras grow
 _Call = Callable[[], Any]
 
 
@@ -110,15 +118,23 @@ def _divided(part: Part) -> Part:
     return Part(faces, refined(part.rest), refined(part.verts))
 
 
-def _frames(count: int, config: str, folder: str) -> _Call:
-    random = np.random.default_rng(0)
-    names = [f"{number:06d}" for number in range(count)]
-    picture = random.integers(0, 256, (_SMALL, _SMALL, 3), dtype=np.uint8)
-    manifest = {
-        "stage": "ingest", "subject": "s", "camera": "c", "width": _SMALL, "height": _SMALL, "K": np.eye(3).tolist(),
+def _manifest(camera: str, names: list[str]) -> dict[str, Any]:
+    """Of a frame pack of small pictures."""
+    return {
+        "stage": "ingest", "subject": "s", "camera": camera, "width": _SMALL, "height": _SMALL, "K": np.eye(3).tolist(),
         "cam_from_world": np.eye(4).tolist(), "distortion": None, "frames": names, "split": {}, "segments": [],
-        "layers": {"rgb": "colour"}, "record": {},
+        "layers": {"rgb": "colour", "alpha": "grey"}, "record": {},
     }  # fmt: skip
+
+
+def _picture() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (_SMALL, _SMALL, 3), dtype=np.uint8)
+
+
+def _frames(count: int, config: str, folder: str) -> _Call:
+    names = [f"{number:06d}" for number in range(count)]
+    picture, manifest = _picture(), _manifest("c", names)
+    manifest["layers"].pop("alpha")
     path = os.path.join(folder, f"{count}.zip")
 
     def call() -> None:
@@ -128,6 +144,63 @@ def _frames(count: int, config: str, folder: str) -> _Call:
         with FramePack(path) as pack:
             for name in names:
                 pack.read("rgb", name)
+
+    return call
+
+
+def _cameras(count: int, config: str, folder: str) -> _Call:
+    names = [f"{number:06d}" for number in range(_FEW)]
+    paths = [os.path.join(folder, f"{count}_{camera}.zip") for camera in range(count)]
+    for path in paths:
+        with FramePackWriter(path, _manifest(os.path.basename(path), names)) as writer:
+            for name in names:
+                writer.add("rgb", name, _picture())
+                writer.add("alpha", name, _picture()[..., 0])
+
+    def call() -> None:
+        with contextlib.ExitStack() as stack:
+            packs = [stack.enter_context(FramePack(path)) for path in paths]
+            views = views_of(packs, names, [names] * count, ("rgb", "alpha"))
+            store = ViewStore(packs, views, PARTS, cache_bytes=1 << 30)
+            for step in range(len(views)):
+                store.sample(shuffled(step, len(views), seed=0))
+
+    return call
+
+
+def _align_cameras(count: int, config: str, folder: str) -> _Call:
+    """Meshes moved and bent to pictures and masks of so many cameras on an arc before the face."""
+    sequence = full_scene(_ALIGNED, dents=False)
+    verts = {name: np.asarray(part.verts, np.float64) for name, part in sequence.parts.items()}
+    faces = {name: part.faces for name, part in sequence.parts.items()}
+    rest = {name: part.rest for name, part in sequence.parts.items()}
+    middle = verts["head"].reshape(-1, 3).mean(0)
+    K = np.array([[2.2 * _SIDE, 0, _SIDE / 2], [0, 2.2 * _SIDE, _SIDE / 2], [0, 0, 1.0]])
+    cameras, masks = [], {}
+    for number in range(count):
+        turn = np.radians(-60 + 120 * (number + 0.5) / count)
+        pose = facing_pose(middle + [np.sin(turn), 0.0, np.cos(turn)], middle, np.array([0.0, 1.0, 0.0]))
+        cameras.append(Camera(str(number), _SIDE, _SIDE, K, pose))
+        for row in range(_ALIGNED):
+            merged, joined, _ = joined_meshes([(verts[name][row], faces[name]) for name in verts])
+            face, _, _ = rasterize_mesh(merged, joined, K, _SIDE, _SIDE, cam_from_world=pose)
+            ends = np.cumsum([len(faces[name]) for name in verts])
+            label = np.where(face >= 0, np.searchsorted(ends, face, side="right") + 1, 0).astype(np.uint8)
+            masks[str(number), row] = label, np.where(face >= 0, 255, 0).astype(np.uint8)
+    picture = np.random.default_rng(0).integers(0, 256, (_SIDE, _SIDE, 3), dtype=np.uint8)
+    options = AlignConfig(iterations=6, modes=12)
+    basis = {name: smooth_basis(rest[name], faces[name], options.modes) for name in verts}
+    labels = {name: place + 1 for place, name in enumerate(verts)}
+
+    def read(camera: str, row: int) -> np.ndarray:
+        return picture
+
+    def mask(camera: str, row: int) -> tuple[np.ndarray, np.ndarray]:
+        return masks[camera, row]
+
+    def call() -> None:
+        align_block(verts, faces, cameras, read, options)
+        bend_block(verts, faces, rest, basis, labels, cameras, read, mask, options)
 
     return call
 
@@ -171,5 +244,7 @@ WORKS = {
     "step.billboards": Work("billboards", [1_151, 11_514, 46_056], _step_billboards),
     "step.pixels": Work("pixels", _PIXELS[:4], _step_pixels),
     "frames": Work("frames", [10, 100, 1_000], _frames),
+    "cameras": Work("cameras", [1, 10, 100, 1_000], _cameras),
+    "align.cameras": Work("cameras", [2, 8, 32], _align_cameras),
     "subjects": Work("subjects", [1, 10, 100, 1_000], _subjects),
 }

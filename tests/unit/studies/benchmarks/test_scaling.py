@@ -1,6 +1,8 @@
 """How cost grows: exponents, scenes of other sizes, what the verb writes."""
 
 import csv
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import pytest
 from nbavatar.cli import main
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.synthetic.scene import full_scene
+from nbavatar.fitting.outline import rims_of
 from nbavatar.io.images import decode_image
 from nbavatar.mesh.topology import boundary_edges, edges
 from nbavatar.studies.benchmarks.scaling import fitted_exponents
@@ -55,15 +58,55 @@ def test_plans_of_more_subjects_have_the_papers_rows_for_each() -> None:
 
 
 def test_the_verb_writes_points_and_exponents(tmp_path, capsys) -> None:
-    words = ["scaling", "--only", "subjects", "frames", "--largest", "100", "--repeats", "1", "--out", str(tmp_path)]
+    words = [
+        "scaling",
+        "--only",
+        "subjects",
+        "frames",
+        "cameras",
+        "--largest",
+        "100",
+        "--repeats",
+        "1",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(["bench", *words]) == 0
     assert "subjects_exponent_at_large" in capsys.readouterr().out
     with open(tmp_path / "scaling.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["work"], int(row["size"])) for row in rows] == [
         *(("subjects", size) for size in (1, 10, 100)), *(("frames", size) for size in (10, 100)),
+        *(("cameras", size) for size in (1, 10, 100)),
     ]  # fmt: skip
     assert all(float(row["ms"]) > 0 for row in rows)
     assert decode_image(tmp_path / "scaling.png").std() > 5
     assert main(["bench", "scaling", "--only", "subjects", "--largest", "1"]) == 2
     assert "--largest: expected at least 10" in capsys.readouterr().err
+
+
+def test_meshes_are_aligned_to_the_cameras_of_the_scene() -> None:
+    """What is measured is the work: meshes that the pictures say nothing about would be left alone at once."""
+    counted = []
+
+    def counting(*arguments):
+        counted.append(rims_of(*arguments))
+        return counted[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nbavatar.fitting.bend.rims_of", counting)
+        WORKS["align.cameras"].prepare(2, "", "")()
+    assert all({rim.camera for rim in rims["head"]} == {0, 1} for rims in counted)
+
+
+def test_more_cameras_than_files_may_be_open_are_told_in_one_line() -> None:
+    """A pack stays open for each camera; the limit is the process's, so another process meets it."""
+    words = ["bench", "scaling", "--only", "cameras", "--largest", "100", "--repeats", "1"]
+    code = (
+        "import resource, sys; from nbavatar.cli import main; "
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (90, 90)); "
+        f"sys.exit(main({words!r}))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 2, run.stderr
+    assert "Too many open files; raise the limit of open files (ulimit -n)" in run.stderr.splitlines()[-1]
