@@ -103,14 +103,18 @@ def _size(out: str) -> int:
 
 def rows_of(lines: Iterable[dict[str, Any]]) -> list[tuple[str, str, str, float, float, float, float]]:
     """Rows of the sheet: (rule, of, unit, units, cpu_s, peak_mb, out_mb), jobs alike joined (means, largest memory)."""
-    last = {(_out(line["words"]), line["words"][0]): line for line in lines if line["code"] == 0}
+    last: dict[tuple[str, str], dict[str, Any]] = {}
+    for line in lines:
+        if line["code"] == 0:
+            # A sweep and its savings are two rules that write into one folder.
+            parts = Path(_out(line["words"])).parts
+            last[_out(line["words"]), _rule(line["words"], parts[2] if len(parts) > 2 else "")] = line
     groups: dict[tuple[str, str, str, float], list[dict[str, Any]]] = defaultdict(list)
-    for (out, verb), line in last.items():
+    for (out, rule), line in last.items():
         parts = Path(out).parts
-        if verb == "synthesize":
+        if rule == "synthesize":
             groups["synthesize", "", "job", 1.0].append(line)
         elif parts[:1] == ("results",) and len(parts) > 2:
-            rule = _rule(verb, line["words"], parts[2])
             unit = _UNITS.get(rule, "job")
             groups[rule, _of(rule, line["words"], parts[3:]), unit, _count(rule, line["words"], out)].append(line)
     rows = []
@@ -120,7 +124,8 @@ def rows_of(lines: Iterable[dict[str, Any]]) -> list[tuple[str, str, str, float,
     return sorted(rows)
 
 
-def _rule(verb: str, words: Sequence[str], folder: str) -> str:
+def _rule(words: Sequence[str], folder: str) -> str:
+    verb = words[0]
     if verb == "tradeoff":
         return "savings" if "--savings" in words else "offline" if "--offline" in words else "tradeoff"
     return "reenact_contact" if folder == "reenact_contact" else verb

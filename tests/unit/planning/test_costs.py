@@ -8,6 +8,7 @@ from nbavatar.config.tradeoff import read_sheet
 from nbavatar.errors import DataError
 from nbavatar.planning.costs import Work, cost_of, read_costs, sweep_pictures, workload
 from tests.unit.planning.plans import ROOT, shipped
+from tools.costs import rows_of
 
 SHEET = read_sheet({"knobs": {"order": ["center"]}, "images": 2, "repeats": 3, "warmup": 1}, "sheet")
 
@@ -99,3 +100,28 @@ def test_what_the_paper_spends_its_time_on_was_measured():
     }
     for cost in costs.values():
         assert all(math.isfinite(line.at(1e6)) and line.slope >= 0 for line in (cost.seconds, cost.memory, cost.disk))
+
+
+def _line(words: str, cpu_s: float, code: int = 0, peak_mb: int = 100) -> dict:
+    return {"words": words.split(), "code": code, "cpu_s": cpu_s, "peak_mb": peak_mb, "out_mb": 1.0}
+
+
+def test_the_jobs_of_a_run_become_rows(tmp_path):
+    """A sweep and its savings write into one folder; what failed, and what was done again, count once."""
+    train = """train --cfg {"steps":2} --out results/run/train/%s/full/model.pt"""
+    lines = [
+        _line("tradeoff --savings --out results/run/tradeoff/S1/full", 800.0),
+        _line("tradeoff --offline --out results/run/tradeoff/S1/offline", 7.0),
+        _line(train % "S1", 90.0, code=137),
+        _line(train % "S1", 100.0, peak_mb=300),
+        _line(train % "S2", 30.0, peak_mb=200),
+        _line(train % "S2", 110.0, peak_mb=200),
+        _line("table --out-stem results/run/tables/a", 0.5),
+        _line("check --out somewhere", 1.0),
+    ]
+    assert rows_of(lines) == [
+        ("offline", "", "job", 1.0, 7.0, 100, 1.0),
+        ("savings", "", "job", 1.0, 800.0, 100, 1.0),
+        ("table", "", "job", 1.0, 0.5, 100, 1.0),
+        ("train", "full", "steps", 2.0, 105.0, 300, 1.0),
+    ]
