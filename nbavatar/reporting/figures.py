@@ -1,6 +1,7 @@
 """Figures for print, PNG and PDF, by matplotlib (imported where a figure is drawn)."""
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["curves_figure", "label_figure", "save_figure", "sensitivity_figure"]
 
+_LINE, _LETTERS = 0.13, 16.0  # of a label: height of a line [in], letters an inch
 _AXES = (
     ("psnr", "PSNR [dB]"),
     ("ssim", "SSIM [1]"),
@@ -110,9 +112,23 @@ def _label_decades(axis: "Axes") -> None:
 
 
 def label_figure(figure: "Figure", label: str) -> None:
-    """Writes along the lower edge why a figure does not show what the paper's does; an empty label changes nothing."""
-    if label:
-        figure.text(0.005, 0.005, label.replace("$", r"\$"), fontsize=7, color="0.35", ha="left", va="bottom")
+    """Writes below a figure, which grows by a strip, why it does not show what the paper's does; nothing if empty."""
+    if not label:
+        return
+    width, height = figure.get_size_inches()
+    lines = textwrap.wrap(label, max(20, int(_LETTERS * width)))
+    strip = _LINE * len(lines) + 0.1
+    share, foot = height / (height + strip), strip / (height + strip)
+    for axes in figure.axes:
+        x, y, across, up = axes.get_position(original=True).bounds
+        axes.set_position((x, foot + share * y, across, share * up))
+    for text in figure.texts:
+        text.set_y(foot + share * text.get_position()[1])
+    for legend in figure.legends:
+        legend.set_bbox_to_anchor((0.0, foot, 1.0, share), transform=figure.transFigure)
+    figure.set_size_inches(width, height + strip)
+    written = "\n".join(lines).replace("$", r"\$")
+    figure.text(0.05 / width, 0.8 * foot, written, fontsize=7, color="0.35", ha="left", va="top")
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
