@@ -51,7 +51,11 @@ def record(usage: Path, command: Sequence[str]) -> int:
         before.chmod(0o755)
         path = os.pathsep.join([folder, str(Path(sys.executable).parent), os.environ.get("PATH", "")])
         environment = {**os.environ, "PATH": path, "NBAVATAR_USAGE": str(usage.resolve())}
-        return subprocess.run(list(command), env=environment, check=False).returncode
+        noted = usage.stat().st_size if usage.exists() else 0
+        code = subprocess.run(list(command), env=environment, check=False).returncode
+    if not usage.exists() or usage.stat().st_size == noted:
+        print(f"{usage}: nothing noted: no nbavatar command was run by way of PATH", file=sys.stderr)
+    return code
 
 
 _FRONT = """import runpy, sys

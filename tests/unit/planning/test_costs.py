@@ -8,7 +8,7 @@ from nbavatar.config.tradeoff import read_sheet
 from nbavatar.errors import DataError
 from nbavatar.planning.costs import Work, cost_of, read_costs, sweep_pictures, workload
 from tests.unit.planning.plans import ROOT, shipped
-from tools.costs import rows_of
+from tools.costs import record, rows_of
 
 SHEET = read_sheet({"knobs": {"order": ["center"]}, "images": 2, "repeats": 3, "warmup": 1}, "sheet")
 
@@ -125,3 +125,11 @@ def test_the_jobs_of_a_run_become_rows(tmp_path):
         ("table", "", "job", 1.0, 0.5, 100, 1.0),
         ("train", "full", "steps", 2.0, 105.0, 300, 1.0),
     ]
+
+
+def test_a_run_that_leaves_no_note_says_so(tmp_path, capsys):
+    """Another `nbavatar` may come first in PATH; hours later the sheet would be empty."""
+    assert record(tmp_path / "usage.jsonl", ["sh", "-c", "exit 3"]) == 3
+    assert "usage.jsonl: nothing noted" in capsys.readouterr().err
+    assert record(tmp_path / "usage.jsonl", ["sh", "-c", "nbavatar schema --help"]) == 0
+    assert capsys.readouterr().err == "" and '"code": 0' in (tmp_path / "usage.jsonl").read_text()
