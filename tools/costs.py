@@ -132,7 +132,7 @@ def _rule(words: Sequence[str], folder: str) -> str:
     verb = words[0]
     if verb == "tradeoff":
         return "savings" if "--savings" in words else "offline" if "--offline" in words else "tradeoff"
-    return "reenact_contact" if folder == "reenact_contact" else verb
+    return "reenact_contact" if (verb, folder) == ("deform", "reenact") else verb
 
 
 def _of(rule: str, words: Sequence[str], parts: Sequence[str]) -> str:

@@ -26,6 +26,7 @@ _COLUMNS = ("rule", "of", "unit", "units", "cpu_s", "peak_mb", "out_mb")
 ON_GPU = ("train", "render", "evaluate", "video", "speed", "tradeoff", "savings")
 """Rules whose jobs lease a GPU where there is one."""
 
+_HELD = ("frames", "views")  # what a job may hold all of; steps and pictures pass one by one
 _GROWTH = 1.1  # of memory, from the smaller measured size to the larger one
 _PICTURES_A_POINT = 2  # every timed picture of a point stands beside one at the exact setting
 
@@ -103,8 +104,8 @@ def _cost(jobs: Sequence[tuple[float, float, float, float]], unit: str) -> Cost:
     constant = unit == "job"
     return Cost(
         _line(sizes, seconds, constant=constant),
-        # Most jobs take one picture at a time: only growth that is more than noise is one.
-        _line(sizes, memory, constant=constant or len(sizes) == 1 or memory[-1] < _GROWTH * memory[0]),
+        # Most jobs take one picture at a time: only growth over frames that is more than noise is one.
+        _line(sizes, memory, constant=unit not in _HELD or len(sizes) == 1 or memory[-1] < _GROWTH * memory[0]),
         # A model is as large after any number of steps.
         _line(sizes, disk, constant=constant or unit == "steps"),
         sizes,

@@ -76,9 +76,11 @@ def test_the_work_of_the_paper_is_that_of_its_sheets():
 def test_memory_grows_only_where_it_was_seen_to_and_models_do_not_grow_with_steps(tmp_path):
     rows = [("fit", "", "views", 8, 3, 400, 1), ("fit", "", "views", 16, 4, 500, 2)]
     rows += [("masks", "", "frames", 4, 2, 383, 1), ("masks", "", "frames", 8, 4, 389, 2)]
-    rows += [("train", "full", "steps", 1, 75, 8000, 795)]
+    rows += [("train", "full", "steps", 1, 75, 8000, 795), ("evaluate", "a", "images", 3, 9, 300, 0)]
+    rows += [("evaluate", "a", "images", 7, 20, 400, 0)]  # one by one: a larger heap, not a larger need
     costs = read_costs(_sheet(tmp_path, *rows))
     assert costs["fit", ""].memory.at(32) == 700 and costs["masks", ""].memory.at(1630) == 389
+    assert costs["evaluate", "a"].memory.at(10_000) == 400
     assert costs["train", "full"].disk.at(400_000) == 795 and costs["train", "full"].seconds.at(10) == 750
 
 
@@ -117,9 +119,12 @@ def test_the_jobs_of_a_run_become_rows(tmp_path):
         _line(train % "S2", 30.0, peak_mb=200),
         _line(train % "S2", 110.0, peak_mb=200),
         _line("table --out-stem results/run/tables/a", 0.5),
+        _line("deform --out results/run/reenact/S1/S2.npz", 9.0, code=1),
+        _line("extremes --out results/run/extremes", 9.0),
         _line("check --out somewhere", 1.0),
     ]
     assert rows_of(lines) == [
+        ("extremes", "", "job", 1.0, 9.0, 100, 1.0),
         ("offline", "", "job", 1.0, 7.0, 100, 1.0),
         ("savings", "", "job", 1.0, 800.0, 100, 1.0),
         ("table", "", "job", 1.0, 0.5, 100, 1.0),
