@@ -56,11 +56,11 @@ def main(args: argparse.Namespace) -> int:
 
         scene = open_scene(args, device)
         viewer = Viewer(scene, host=args.host, port=args.port, side=args.side, title=f"nbavatar: {args.path[0]}")
-        print(f"viewer: {viewer.address}   (Ctrl-C ends it)", flush=True)
-        if os.environ.get("SSH_CONNECTION") and args.host == "127.0.0.1":
-            port = viewer.server.get_port()
-            print(f"from your own machine first: ssh -L {port}:127.0.0.1:{port} {os.uname().nodename}", flush=True)
-        try:
+        try:  # whoever reads the address may interrupt at once
+            print(f"viewer: {viewer.address}   (Ctrl-C ends it)", flush=True)
+            if os.environ.get("SSH_CONNECTION") and args.host == "127.0.0.1":
+                port = viewer.server.get_port()
+                print(f"from your own machine first: ssh -L {port}:127.0.0.1:{port} {os.uname().nodename}", flush=True)
             threading.Event().wait()
         except KeyboardInterrupt:
             print()
