@@ -8,7 +8,7 @@ process ends, however it ends. It does not hold between containers with networks
 and to be called before torch is imported.
 
 Without a GPU a process keeps the memory that it frees. The C library gives large blocks back to the system at once, and
-the system clears every page of the next one: in a training step at 1024 px that was a quarter of the processor time.
+the system clears every page of the next one: in a training step at 1024 px that was a fifth of the processor time.
 """
 # provenance: neutral, because where it is computed is recorded.
 

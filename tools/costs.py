@@ -111,8 +111,7 @@ def rows_of(lines: Iterable[dict[str, Any]]) -> list[tuple[str, str, str, float,
     for line in lines:
         if line["code"] == 0:
             # A sweep and its savings are two rules that write into one folder.
-            parts = Path(_out(line["words"])).parts
-            last[_out(line["words"]), _rule(line["words"], parts[2] if len(parts) > 2 else "")] = line
+            last[_out(line["words"]), _rule(line["words"])] = line
     groups: dict[tuple[str, str, str, float], list[dict[str, Any]]] = defaultdict(list)
     for (out, rule), line in last.items():
         parts = Path(out).parts
@@ -128,11 +127,12 @@ def rows_of(lines: Iterable[dict[str, Any]]) -> list[tuple[str, str, str, float,
     return sorted(rows)
 
 
-def _rule(words: Sequence[str], folder: str) -> str:
+def _rule(words: Sequence[str]) -> str:
     verb = words[0]
     if verb == "tradeoff":
         return "savings" if "--savings" in words else "offline" if "--offline" in words else "tradeoff"
-    return "reenact_contact" if (verb, folder) == ("deform", "reenact") else verb
+    reenacted = Path(_out(words)).parts[2:3] == ("reenact",)
+    return "reenact_contact" if verb == "deform" and reenacted else verb
 
 
 def _of(rule: str, words: Sequence[str], parts: Sequence[str]) -> str:

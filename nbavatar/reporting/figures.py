@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["curves_figure", "label_figure", "save_figure", "sensitivity_figure"]
 
-_LINE, _LETTERS = 0.13, 16.0  # of a label: height of a line [in], letters an inch
+_LINE, _LETTERS = 0.14, 16.0  # of a label: height of a line [in], letters an inch
 _AXES = (
     ("psnr", "PSNR [dB]"),
     ("ssim", "SSIM [1]"),
@@ -128,7 +128,7 @@ def label_figure(figure: "Figure", label: str) -> None:
         legend.set_bbox_to_anchor((0.0, foot, 1.0, share), transform=figure.transFigure)
     figure.set_size_inches(width, height + strip)
     written = "\n".join(lines).replace("$", r"\$")
-    figure.text(0.05 / width, 0.8 * foot, written, fontsize=7, color="0.35", ha="left", va="top")
+    figure.text(0.05 / width, foot - 0.05 / (height + strip), written, fontsize=7, color="0.35", ha="left", va="top")
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from nbavatar.camera.pinhole import Camera, facing_pose
+from nbavatar.camera.pinhole import Camera
 from nbavatar.config.geometry import AlignConfig
 from nbavatar.config.yamlfiles import read_yaml
 from nbavatar.data.sequences import PARTS, MeshSequence, Part
@@ -23,6 +23,7 @@ from nbavatar.methods.billboards.unet import UNet
 from nbavatar.planning import units
 from nbavatar.planning.run import Plan, read_plan
 from nbavatar.rendering.billboards.functional import render_billboards
+from nbavatar.studies.benchmarks.fit_scene import FOCAL, HEIGHT, arc
 from nbavatar.studies.benchmarks.raster_scene import make_scene
 from nbavatar.studies.benchmarks.step_scene import StepScene, training_options
 
@@ -118,12 +119,12 @@ def _divided(part: Part) -> Part:
     return Part(faces, refined(part.rest), refined(part.verts))
 
 
-def _manifest(camera: str, names: list[str]) -> dict[str, Any]:
+def _manifest(camera: str, names: list[str], *layers: str) -> dict[str, Any]:
     """Of a frame pack of small pictures."""
     return {
         "stage": "ingest", "subject": "s", "camera": camera, "width": _SMALL, "height": _SMALL, "K": np.eye(3).tolist(),
         "cam_from_world": np.eye(4).tolist(), "distortion": None, "frames": names, "split": {}, "segments": [],
-        "layers": {"rgb": "colour", "alpha": "grey"}, "record": {},
+        "layers": dict.fromkeys(layers, ""), "record": {},
     }  # fmt: skip
 
 
@@ -133,8 +134,7 @@ def _picture() -> np.ndarray:
 
 def _frames(count: int, config: str, folder: str) -> _Call:
     names = [f"{number:06d}" for number in range(count)]
-    picture, manifest = _picture(), _manifest("c", names)
-    manifest["layers"].pop("alpha")
+    picture, manifest = _picture(), _manifest("c", names, "rgb")
     path = os.path.join(folder, f"{count}.zip")
 
     def call() -> None:
@@ -151,11 +151,12 @@ def _frames(count: int, config: str, folder: str) -> _Call:
 def _cameras(count: int, config: str, folder: str) -> _Call:
     names = [f"{number:06d}" for number in range(_FEW)]
     paths = [os.path.join(folder, f"{count}_{camera}.zip") for camera in range(count)]
+    picture = _picture()
     for path in paths:
-        with FramePackWriter(path, _manifest(os.path.basename(path), names)) as writer:
+        with FramePackWriter(path, _manifest(os.path.basename(path), names, "rgb", "alpha")) as writer:
             for name in names:
-                writer.add("rgb", name, _picture())
-                writer.add("alpha", name, _picture()[..., 0])
+                writer.add("rgb", name, picture)
+                writer.add("alpha", name, picture[..., 0])
 
     def call() -> None:
         with contextlib.ExitStack() as stack:
@@ -174,23 +175,22 @@ def _align_cameras(count: int, config: str, folder: str) -> _Call:
     verts = {name: np.asarray(part.verts, np.float64) for name, part in sequence.parts.items()}
     faces = {name: part.faces for name, part in sequence.parts.items()}
     rest = {name: part.rest for name, part in sequence.parts.items()}
-    middle = verts["head"].reshape(-1, 3).mean(0)
-    K = np.array([[2.2 * _SIDE, 0, _SIDE / 2], [0, 2.2 * _SIDE, _SIDE / 2], [0, 0, 1.0]])
-    cameras, masks = [], {}
-    for number in range(count):
-        turn = np.radians(-60 + 120 * (number + 0.5) / count)
-        pose = facing_pose(middle + [np.sin(turn), 0.0, np.cos(turn)], middle, np.array([0.0, 1.0, 0.0]))
-        cameras.append(Camera(str(number), _SIDE, _SIDE, K, pose))
-        for row in range(_ALIGNED):
-            merged, joined, _ = joined_meshes([(verts[name][row], faces[name]) for name in verts])
-            face, _, _ = rasterize_mesh(merged, joined, K, _SIDE, _SIDE, cam_from_world=pose)
-            ends = np.cumsum([len(faces[name]) for name in verts])
-            label = np.where(face >= 0, np.searchsorted(ends, face, side="right") + 1, 0).astype(np.uint8)
-            masks[str(number), row] = label, np.where(face >= 0, 255, 0).astype(np.uint8)
+    focal = FOCAL * _SIDE / HEIGHT
+    K = np.array([[focal, 0, _SIDE / 2], [0, focal, _SIDE / 2], [0, 0, 1.0]])
+    poses = arc(verts["head"].mean((0, 1)), count, np.random.default_rng(0))
+    cameras = [Camera(str(number), _SIDE, _SIDE, K, pose) for number, pose in enumerate(poses)]
+    labels = {name: place for place, name in enumerate(verts, start=1)}
+    owner = np.repeat(list(labels.values()), [len(faces[name]) for name in verts]).astype(np.uint8)
+    masks = {}
+    for row in range(_ALIGNED):
+        merged, joined, _ = joined_meshes([(verts[name][row], faces[name]) for name in verts])
+        for camera in cameras:
+            face, _, _ = rasterize_mesh(merged, joined, K, _SIDE, _SIDE, cam_from_world=camera.cam_from_world)
+            label = np.where(face >= 0, owner[face], np.uint8(0))
+            masks[camera.name, row] = label, np.where(label > 0, np.uint8(255), np.uint8(0))
     picture = np.random.default_rng(0).integers(0, 256, (_SIDE, _SIDE, 3), dtype=np.uint8)
     options = AlignConfig(iterations=6, modes=12)
     basis = {name: smooth_basis(rest[name], faces[name], options.modes) for name in verts}
-    labels = {name: place + 1 for place, name in enumerate(verts)}
 
     def read(camera: str, row: int) -> np.ndarray:
         return picture

@@ -5,6 +5,7 @@ that are absent, and everything when no billboard is in the picture.
 """
 
 import contextlib
+import copy
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -25,7 +26,6 @@ from nbavatar.methods.billboards.compression.reduce import avatar_bytes, keep_bi
 from nbavatar.methods.billboards.compression.textures import resample_textures
 from nbavatar.methods.billboards.region import Region, full_region, paste, region_of, shift_camera, visible_box
 from nbavatar.rendering.billboards.functional import render_billboards
-from nbavatar.studies.tradeoff.decoder import prepared_unet
 
 __all__ = ["Laps", "TunedAvatar", "Work", "texels_needed"]
 
@@ -100,7 +100,9 @@ class TunedAvatar:
         if setting.texels is not None:
             avatar = resize_textures(avatar, setting.texels)
         self.avatar = avatar
-        self._unet = prepared_unet(avatar.unet, channels_last=setting.channels_last)
+        self._unet = avatar.unet
+        if avatar.unet is not None and not setting.channels_last:
+            self._unet = copy.deepcopy(avatar.unet).to(memory_format=torch.contiguous_format).eval()
         self._scenes: dict[tuple[str, ...], _Scene] = {}
 
     @property

@@ -1,10 +1,13 @@
 """What a run will cost: the line through measured jobs, and how many jobs of which size there are."""
 
+import json
 import math
 
+import numpy as np
 import pytest
 
 from nbavatar.config.tradeoff import read_sheet
+from nbavatar.data.sequences import MeshSequence, Part, write_sequence
 from nbavatar.errors import DataError
 from nbavatar.planning.costs import Work, cost_of, read_costs, sweep_pictures, workload
 from tests.unit.planning.plans import ROOT, shipped
@@ -108,26 +111,39 @@ def _line(words: str, cpu_s: float, code: int = 0, peak_mb: int = 100) -> dict:
     return {"words": words.split(), "code": code, "cpu_s": cpu_s, "peak_mb": peak_mb, "out_mb": 1.0}
 
 
-def test_the_jobs_of_a_run_become_rows(tmp_path):
+def test_the_jobs_of_a_run_become_rows(tmp_path, monkeypatch):
     """A sweep and its savings write into one folder; what failed, and what was done again, count once."""
+    monkeypatch.chdir(tmp_path)
+    for place in ("deform/S1.npz", "reenact/S1/S2.npz"):
+        path = tmp_path / "results/run" / place
+        path.parent.mkdir(parents=True)
+        part = Part(np.array([[0, 1, 2]]), np.eye(3, dtype=np.float32), np.zeros((5, 3, 3), np.float32))
+        write_sequence(path, MeshSequence([str(i) for i in range(5)], {"head": part}, {}), {})
+    sheet = {"knobs": {}, "images": 1, "repeats": 1, "warmup": 0}
     train = """train --cfg {"steps":2} --out results/run/train/%s/full/model.pt"""
     lines = [
         _line("tradeoff --savings --out results/run/tradeoff/S1/full", 800.0),
+        _line(f"tradeoff --sheet {json.dumps(sheet, separators=(',', ':'))} --out results/run/tradeoff/S1/full", 300.0),
         _line("tradeoff --offline --out results/run/tradeoff/S1/offline", 7.0),
         _line(train % "S1", 90.0, code=137),
         _line(train % "S1", 100.0, peak_mb=300),
         _line(train % "S2", 30.0, peak_mb=200),
         _line(train % "S2", 110.0, peak_mb=200),
         _line("table --out-stem results/run/tables/a", 0.5),
+        _line("deform --out results/run/deform/S1.npz", 2.0),
+        _line("deform --out results/run/reenact/S1/S2.npz", 3.0),
         _line("deform --out results/run/reenact/S1/S2.npz", 9.0, code=1),
         _line("extremes --out results/run/extremes", 9.0),
         _line("check --out somewhere", 1.0),
     ]
     assert rows_of(lines) == [
+        ("deform", "", "frames", 5.0, 2.0, 100, 1.0),
         ("extremes", "", "job", 1.0, 9.0, 100, 1.0),
         ("offline", "", "job", 1.0, 7.0, 100, 1.0),
+        ("reenact_contact", "", "frames", 5.0, 3.0, 100, 1.0),
         ("savings", "", "job", 1.0, 800.0, 100, 1.0),
         ("table", "", "job", 1.0, 0.5, 100, 1.0),
+        ("tradeoff", "", "pictures", float(sweep_pictures(read_sheet(sheet, "sheet"))), 300.0, 100, 1.0),
         ("train", "full", "steps", 2.0, 105.0, 300, 1.0),
     ]
 

@@ -17,6 +17,7 @@ from nbavatar.io.framepack import FramePack, FramePackWriter
 from nbavatar.io.images import decode_image
 from nbavatar.reporting.comparison import Rendered, frames_in_contact
 from nbavatar.reporting.contact import best_camera, deepest_frames, dent_pictures, dent_scale
+from nbavatar.reporting.figures import label_figure
 from nbavatar.reporting.gallery import comparison_drawn, curves_drawn
 from nbavatar.reporting.pareto import Measured, measured_variants, pareto_figure, pareto_front, scatter_chart
 
@@ -198,6 +199,17 @@ def test_a_rehearsal_is_written_below_its_figures_and_covers_nothing(tmp_path):
     assert len(long) > len(marked) and (long[len(plain) :, -8:] == 255).all()
     assert json.loads((tmp_path / "marked.json").read_text())["label"] == "rehearsal, $2 steps"
     assert "label" not in json.loads((tmp_path / "plain.json").read_text())
+
+
+def test_the_strip_of_a_label_lies_below_all_that_is_drawn():
+    variants = [Measured(f"variant_{n}", {"psnr": 20.0 + n}, {"ms": 5.0 + n}) for n in range(9)]  # a legend of two rows
+    figure = pareto_figure(variants)
+    label_figure(figure, "rehearsal: " + "synthetic people in few frames, " * 9)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    label = figure.texts[-1].get_window_extent()
+    drawn = [axes.get_tightbbox() for axes in figure.axes] + [legend.get_window_extent() for legend in figure.legends]
+    assert len(drawn) > 1 and 0 < label.y0 and label.y1 < min(box.y0 for box in drawn)
 
 
 def test_no_label_of_training_curves_is_cut_off():

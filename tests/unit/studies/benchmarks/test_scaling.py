@@ -10,6 +10,7 @@ import pytest
 from nbavatar.cli import main
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.synthetic.scene import full_scene
+from nbavatar.fitting.details import look
 from nbavatar.fitting.outline import rims_of
 from nbavatar.io.images import decode_image
 from nbavatar.mesh.topology import boundary_edges, edges
@@ -58,19 +59,8 @@ def test_plans_of_more_subjects_have_the_papers_rows_for_each() -> None:
 
 
 def test_the_verb_writes_points_and_exponents(tmp_path, capsys) -> None:
-    words = [
-        "scaling",
-        "--only",
-        "subjects",
-        "frames",
-        "cameras",
-        "--largest",
-        "100",
-        "--repeats",
-        "1",
-        "--out",
-        str(tmp_path),
-    ]
+    works = ["subjects", "frames", "cameras"]
+    words = ["scaling", "--only", *works, "--largest", "100", "--repeats", "1", "--out", str(tmp_path)]
     assert main(["bench", *words]) == 0
     assert "subjects_exponent_at_large" in capsys.readouterr().out
     with open(tmp_path / "scaling.csv", newline="") as stream:
@@ -85,18 +75,30 @@ def test_the_verb_writes_points_and_exponents(tmp_path, capsys) -> None:
     assert "--largest: expected at least 10" in capsys.readouterr().err
 
 
-def test_meshes_are_aligned_to_the_cameras_of_the_scene() -> None:
+def test_meshes_are_aligned_to_the_cameras_of_the_scene(monkeypatch) -> None:
     """What is measured is the work: meshes that the pictures say nothing about would be left alone at once."""
-    counted = []
+    counted, seen = [], []
 
     def counting(*arguments):
         counted.append(rims_of(*arguments))
         return counted[-1]
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nbavatar.fitting.bend.rims_of", counting)
-        WORKS["align.cameras"].prepare(2, "", "")()
-    assert all({rim.camera for rim in rims["head"]} == {0, 1} for rims in counted)
+    def looking(*arguments):
+        found = look(*arguments)
+        seen.append(found[0])
+        return found
+
+    monkeypatch.setattr("nbavatar.fitting.bend.rims_of", counting)
+    for stage in ("align", "bend"):
+        monkeypatch.setattr(f"nbavatar.fitting.{stage}.look", looking)
+    WORKS["align.cameras"].prepare(3, "", "")()
+    assert len(counted) == 2 and len(seen) == 2  # two scales of detail; moved, then bent
+    for rims in counted:
+        assert {rim.camera for rim in rims["head"]} == {0, 1, 2}
+    # The middle camera is before the face: the nose's tip, the head's foremost vertex, is seen in all frames.
+    head = full_scene(4, dents=False).parts["head"].verts
+    tip = int(np.argmin(head[0][:, 1]))
+    assert all(visible["head"][1, :, tip].all() for visible in seen)
 
 
 def test_more_cameras_than_files_may_be_open_are_told_in_one_line() -> None:
