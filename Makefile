@@ -56,7 +56,7 @@ bench: install  ## benchmarks of the kernels
 docs: install  ## the documentation as a site: build/docs/docs/index.html
 	$(BIN)/python -m sphinx -W --keep-going -q -c docs . build/docs
 
-pictures: install  ## the pictures of README.md and docs/, from a synthetic person; an hour and more
+pictures: install  ## the pictures of README.md and docs/, from a synthetic person; half an hour and more
 	$(BIN)/python -m tools.pictures --cores $(CORES)
 
 lint: install  ## formatting, style, types, layers, workflow

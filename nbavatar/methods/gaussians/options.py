@@ -39,8 +39,10 @@ class DensityConfig:
     )
     reset: int = option(60_000, "Iterations between two resets of all opacities to 0.01 at most; 0 = never.", min=0)
     max_gaussians: int | None = option(None, "Most Gaussians; none by default.", min=1)
-    floor_steps: int = option(100, "Fast: fewest steps between two densifications.", min=1)
-    reset_floor_steps: int = option(1_000, "Fast: fewest steps between two resets of the opacities.", min=1)
+    floor_steps: int = option(100, "Fast: fewest steps between two densifications, and after the last.", min=1)
+    reset_floor_steps: int = option(
+        1_000, "Fast: fewest steps between two resets of the opacities, and after the last.", min=1
+    )
 
 
 @dataclass(frozen=True)

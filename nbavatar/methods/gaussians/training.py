@@ -57,7 +57,7 @@ class Calendar:
     def __init__(self, published: int, steps: int | None, *, scaled: bool) -> None:
         self._published, self._steps, self._scaled = published, steps, scaled
         self.before = self.now = 0.0
-        self._per_step = 1.0
+        self._step, self._per_step = 0, 1.0
 
     def advance(self, step: int, progress: float) -> None:
         """Count a step.
@@ -67,6 +67,7 @@ class Calendar:
             progress: of the training at its start, in [0, 1].
         """
         self.before = self.now
+        self._step = step + 1
         if not self._scaled:
             self.now = float(step + 1)
             return
@@ -79,12 +80,14 @@ class Calendar:
 
         Args:
             interval: 0 means never.
-            floor_steps: in a scaled training, the fewest steps between two times.
+            floor_steps: in a scaled training, the fewest steps between two times, and from the last one to the end:
+                opacities that were just reset would be judged before they have come back.
         """
-        if interval <= 0:
+        if interval <= 0 or (self._scaled and self.now + floor_steps * self._per_step > self._published):
             return False
-        spacing = max(float(interval), floor_steps * self._per_step) if self._scaled else float(interval)
-        return math.floor(self.now / spacing + 1e-9) > math.floor(self.before / spacing + 1e-9)
+        if self._scaled and floor_steps * self._per_step > interval:
+            return self._step % floor_steps == 0
+        return math.floor(self.now / interval + 1e-9) > math.floor(self.before / interval + 1e-9)
 
 
 class GaussianTraining(Method):
