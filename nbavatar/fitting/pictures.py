@@ -52,7 +52,9 @@ def _choose(fitted: MeshSequence, count: int) -> Sequence[int]:
 def _view(fitted: MeshSequence, packs: Mapping[str, FramePack], camera: str, index: int) -> View:
     extras, frame = fitted.extras, fitted.frames[index]
     pack = packs.get(camera)
-    image = pack.read("rgb", frame) if pack is not None and frame in pack.frames else None
+    image = None
+    if pack is not None and "rgb" in pack.layers and frame in pack.frames:
+        image = pack.read("rgb", frame)
     K = np.asarray(extras[f"camera.{camera}.K"], np.float64)
     default = (2 * K[0, 2], 2 * K[1, 2])
     size = np.asarray(extras.get(f"camera.{camera}.size", default)).round().astype(int)

@@ -16,8 +16,10 @@ from nbavatar.data.sequences import read_sequence
 from nbavatar.data.synthetic.models import load_human, mano_content
 from nbavatar.data.synthetic.scene import _unwrapped
 from nbavatar.errors import DataError
+from nbavatar.fitting.pictures import contact_sheet
 from nbavatar.fitting.stage import Bodies, fit_sequence
 from nbavatar.io.arrays import write_arrays
+from nbavatar.io.framepack import FramePack, FramePackWriter
 from nbavatar.studies.benchmarks.fit_scene import WIDTH, perturb
 
 from .scenes import make_take, vertex_error_mm
@@ -285,6 +287,15 @@ def test_command_line(tmp_path, capsys):
     assert record["fit"]["right_hand"]["handedness"]["found"] == "right"
     assert "right_hand: side of the hand as said" in capsys.readouterr().out
     assert decode_image(tmp_path / "fit.png").shape[0] > 4 * 96
+    # Packs of masks alone serve the fit; the sheet, made after it, draws their cameras on grey.
+    place = {"subject": "S2", "camera": "100", "cam_from_world": np.eye(4).tolist(), "width": 8, "height": 8}
+    manifest = {"stage": "masks", "frames": take.frames, "layers": {"label": ""}, **place}
+    with FramePackWriter(tmp_path / "masks.zip", manifest) as writer:
+        for frame in take.frames:
+            writer.add("label", frame, np.ones((8, 8), np.uint8))
+    with FramePack(tmp_path / "masks.zip") as pack:
+        drawn = contact_sheet(fitted, {"100": pack}, frames=2, cameras=1, tile=96)
+    np.testing.assert_array_equal(drawn, contact_sheet(fitted, {}, frames=2, cameras=1, tile=96))
     assert main([*map(str, command[:-2]), "--cfg", '{"iterations": -1}']) == 2
     assert "iterations" in capsys.readouterr().err
     wrong = {key.replace("right_hand", "left_hand"): value for key, value in take.extras.items() if ".head." not in key}
