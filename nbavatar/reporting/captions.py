@@ -91,7 +91,8 @@ def describe_trainings(layout: TableLayout, results: Sequence[tuple[Mapping[str,
         method = str(first.get("method") or "billboards").replace("_", " ")
         mode = f", mode {first['mode']}" if first.get("mode") else ""
         steps = sorted({int(training["steps"]) for training in found if training.get("steps") is not None})
-        budget = f", {' to '.join(f'{n:,}' for n in dict.fromkeys((steps[0], steps[-1])))} steps" if steps else ""
+        numbers = " to ".join(f"{n:,}" for n in dict.fromkeys((steps[0], steps[-1]))) if steps else ""
+        budget = f", {numbers} {'step' if numbers == '1' else 'steps'}" if steps else ""
         words.append(f"{plain(row.label)}: {method}{mode}{budget}")
     return [f"Trained here: {'; '.join(dict.fromkeys(words))}."] if words else []
 
@@ -102,7 +103,10 @@ def describe_few_steps(layout: TableLayout, results: Sequence[tuple[Mapping[str,
     steps = [int(training["steps"]) for training in trainings if training.get("steps") is not None]
     if not steps or max(steps) >= _FEW_STEPS or layout.kind == "cameras":
         return ""
-    return f"{max(steps):,} training steps rank nothing: they show that every stage runs, not which method is better."
+    shown = "that every stage runs, not which method is better."
+    if max(steps) <= 1:
+        return f"One training step ranks nothing: it shows {shown}"
+    return f"{max(steps):,} training steps rank nothing: they show {shown}"
 
 
 def describe_difference(label: str) -> str:

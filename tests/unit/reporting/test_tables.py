@@ -221,11 +221,16 @@ def test_cost_stands_beside_quality_with_mode_and_budget_of_every_method(tmp_pat
 
 
 def test_the_caption_says_when_trainings_were_too_short_to_rank_anything(tmp_path):
-    trained = {"method": "billboards", "steps": 120}
-    paths = [evaluation(tmp_path, "S2", v, "nv1024", 64, training=trained) for v in ("full", "splatting_avatar")]
-    _, markdown, latex = make(tmp_path, "cost", paths)
-    said = "120 training steps rank nothing: they show that every stage runs, not which method is better."
-    assert said in markdown.split("| ")[0] and said in latex.partition("\\caption")[2].partition("\n")[0]
+    for steps, words, budget in (
+        (120, "120 training steps rank nothing: they show", "billboards, 120 steps."),
+        (1, "One training step ranks nothing: it shows", "billboards, 1 step."),
+    ):
+        trained = {"method": "billboards", "steps": steps}
+        paths = [evaluation(tmp_path, "S2", v, "nv1024", 64, training=trained) for v in ("full", "splatting_avatar")]
+        _, markdown, latex = make(tmp_path, "cost", paths)
+        said = f"{words} that every stage runs, not which method is better."
+        assert said in markdown.split("| ")[0] and said in latex.partition("\\caption")[2].partition("\n")[0]
+        assert budget in markdown
 
 
 def test_baselines_fill_the_rows_of_the_paper(tmp_path):
