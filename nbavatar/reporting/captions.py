@@ -104,7 +104,7 @@ def describe_few_steps(layout: TableLayout, results: Sequence[tuple[Mapping[str,
     if not steps or max(steps) >= _FEW_STEPS or layout.kind == "cameras":
         return ""
     shown = "that every stage runs, not which method is better."
-    if max(steps) <= 1:
+    if max(steps) == 1:
         return f"One training step ranks nothing: it shows {shown}"
     return f"{max(steps):,} training steps rank nothing: they show {shown}"
 

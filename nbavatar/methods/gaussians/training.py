@@ -80,14 +80,17 @@ class Calendar:
 
         Args:
             interval: 0 means never.
-            floor_steps: in a scaled training, the fewest steps between two times, and from the last one to the end:
-                opacities that were just reset would be judged before they have come back.
+            floor_steps: in a scaled training, the fewest steps between two times.
         """
-        if interval <= 0 or (self._scaled and self.now + floor_steps * self._per_step > self._published):
+        if interval <= 0:
             return False
         if self._scaled and floor_steps * self._per_step > interval:
             return self._step % floor_steps == 0
         return math.floor(self.now / interval + 1e-9) > math.floor(self.before / interval + 1e-9)
+
+    def leaves(self, steps: int) -> bool:
+        """Whether a scaled training has so many steps left: what has to settle would else be judged before it has."""
+        return not self._scaled or self.now + steps * self._per_step <= self._published
 
 
 class GaussianTraining(Method):
@@ -176,9 +179,10 @@ class GaussianTraining(Method):
         if calendar.now < density.stop:
             if aux.offsets.grad is not None:
                 self.statistics.observe(aux.offsets.grad, aux.radii, aux.rows, aux.width, aux.height)
-            if calendar.now >= density.start and calendar.due(density.interval, density.floor_steps):
+            floor, reset_floor = density.floor_steps, density.reset_floor_steps
+            if calendar.now >= density.start and calendar.due(density.interval, floor) and calendar.leaves(floor):
                 self._control(optimizer, aux, random)
-            if calendar.due(density.reset, density.reset_floor_steps):
+            if calendar.due(density.reset, reset_floor) and calendar.leaves(reset_floor):
                 reset_opacity(self.avatar, optimizer)
         self.between_steps(optimizer, step, random)
 

@@ -181,21 +181,24 @@ def test_losses_in_the_box_are_those_of_the_whole_picture() -> None:
 
 
 def test_calendar_keeps_published_intervals_or_scales_them() -> None:
-    def times(calendar: Calendar, steps: int, interval: int, floor: int = 1) -> list[int]:
+    def times(calendar: Calendar, steps: int, interval: int, floor: int = 1, rest: int = 0) -> list[int]:
         found = []
         for step in range(steps):
             calendar.advance(step, step / steps)
-            if calendar.due(interval, floor):
+            if calendar.due(interval, floor) and calendar.leaves(rest):
                 found.append(step + 1)
         return found
 
     assert times(Calendar(30_000, 500, scaled=False), 500, 100, 300) == [100, 200, 300, 400, 500]
-    # A thirtieth of the steps: the same share of the training, but never more often than the floor, and not so late
-    # that fewer steps would follow: opacities that are reset in the last steps leave a translucent avatar.
-    assert times(Calendar(30_000, 1_000, scaled=True), 1_000, 3_000) == list(range(100, 1_000, 100))
-    assert times(Calendar(30_000, 1_000, scaled=True), 1_000, 100, 250) == [250, 500, 750]
-    assert times(Calendar(30_000, 1_100, scaled=True), 1_100, 100, 250) == [250, 500, 750]
-    assert times(Calendar(30_000, None, scaled=True), 1_100, 100, 250) == [250, 500, 750]  # time decides: by progress
+    # A thirtieth of the steps: the same share of the training, but never more often than the floor.
+    assert times(Calendar(30_000, 1_000, scaled=True), 1_000, 3_000) == list(range(100, 1_001, 100))
+    assert times(Calendar(30_000, 1_000, scaled=True), 1_000, 100, 250) == [250, 500, 750, 1_000]
+    assert times(Calendar(30_000, None, scaled=True), 1_100, 100, 250) == [250, 500, 750, 1_000]  # time decides
+    # Opacities that are reset in the last steps leave a translucent avatar.
+    assert times(Calendar(30_000, 500, scaled=False), 500, 100, 300, rest=300) == [100, 200, 300, 400, 500]
+    assert times(Calendar(30_000, 1_000, scaled=True), 1_000, 100, 250, rest=250) == [250, 500, 750]
+    assert times(Calendar(30_000, 1_100, scaled=True), 1_100, 100, 250, rest=250) == [250, 500, 750]
+    assert times(Calendar(30_000, None, scaled=True), 1_100, 100, 250, rest=250) == [250, 500, 750]
     assert times(Calendar(30_000, 1_000, scaled=True), 100, 0) == []
     resumed = Calendar(30_000, 1_000, scaled=True)
     resumed.now = 99 * 30.0
