@@ -71,10 +71,11 @@ def feature_pictures(avatar: Avatar, verts: Mapping[str, Tensor], view: View) ->
     with torch.no_grad():
         posed, keep = avatar.pose(verts)
         window = avatar.window(posed, keep, view.viewmat, view.K, view.width, view.height, roi=False)
+        own = window.features[: avatar.architecture.channels]  # normals that the decoder sees are not learnt
         size = view.width, view.height
         features, nb_alpha, colour, alpha = (
             paste(values, window.region, *size).double().numpy()
-            for values in (window.features, window.nb_alpha, window.colour, window.alpha)
+            for values in (own, window.nb_alpha, window.colour, window.alpha)
         )
     picture = colour.clip(0, 1) * alpha + 1 - alpha
     return {

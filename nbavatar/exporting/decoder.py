@@ -1,7 +1,9 @@
 """The U-Net of an avatar as an ONNX model.
 
     input    features  float32 (1, C+1, H, W)   premultiplied features and the billboards' alpha (the last channel);
-                                                H and W multiples of 2^depth, and at least twice that
+                                                H and W multiples of 2^depth, and at least twice that. Where the
+                                                metadata says `normals`, (1, C+4, H, W): the faces' unit normals,
+                                                world, premultiplied too, between features and alpha
     outputs  colour    float32 (1, 3, H, W)     I_R in [0, 1], sRGB
              opacity   float32 (1, 1, H, W)     I_alpha in [0, 1]
 
@@ -43,7 +45,7 @@ def decoder_model(avatar: MeshAvatar, record: dict[str, Any]) -> bytes:
     require("onnxscript", "onnxscript", "nbavatar export --to decoder")
     unet, multiple = avatar.unet, avatar.multiple
     size = 4 * multiple
-    example = torch.zeros(1, avatar.architecture.channels + 1, size, size)
+    example = torch.zeros(1, avatar.architecture.decoded_channels, size, size)
     rows, columns = torch.export.Dim("rows", min=2, max=512), torch.export.Dim("columns", min=2, max=512)
     # The exporter's own remarks (packages that it could also use, functions of torch that will go) are not the user's.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
@@ -61,7 +63,8 @@ def decoder_model(avatar: MeshAvatar, record: dict[str, Any]) -> bytes:
         )
     assert program is not None
     model = program.model_proto
-    known = {"multiple": multiple, "channels": avatar.architecture.channels, "export": record}
+    a = avatar.architecture
+    known = {"multiple": multiple, "channels": a.channels, "normals": a.normals, "export": record}
     onnx.helper.set_model_props(model, {name: json.dumps(value, sort_keys=True) for name, value in known.items()})
     stream = io.BytesIO()
     onnx.save_model(model, stream)

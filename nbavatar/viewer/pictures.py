@@ -186,7 +186,7 @@ def _primitives(
             opacity, colours = opacity[keep], colours[keep]
         features = colours[:, None, None].expand(*opacity.shape, 3).contiguous()
         colour, alpha = render_billboards(
-            *placed, features, opacity, viewmat, K, width, height, order=avatar.architecture.order
+            *placed.planes, features, opacity, viewmat, K, width, height, order=avatar.architecture.order
         )
     return colour + (1.0 - alpha) * background[:, None, None]
 
@@ -202,7 +202,9 @@ def _features(
     features = features[..., [min(i, features.shape[-1] - 1) for i in range(3)]].contiguous()
     if keep is not None:
         features, alpha = features[keep], alpha[keep]
-    shown, _ = render_billboards(*posed, features, alpha, viewmat, K, width, height, order=avatar.architecture.order)
+    shown, _ = render_billboards(
+        *posed.planes, features, alpha, viewmat, K, width, height, order=avatar.architecture.order
+    )
     return 0.5 + 0.5 * torch.tanh(shown)
 
 

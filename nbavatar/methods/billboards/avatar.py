@@ -19,7 +19,7 @@ from nbavatar.config.evaluation import EAGER
 from nbavatar.math.rotations import matrix_to_quaternion
 from nbavatar.mesh.frames import FaceFrames, face_frames
 from nbavatar.methods.base import MeshAvatar, Stages, compose
-from nbavatar.methods.billboards.billboards import Billboards, Posed
+from nbavatar.methods.billboards.billboards import Billboards, Posed, with_normals
 from nbavatar.methods.billboards.compression.sized import SizedBillboards
 from nbavatar.methods.billboards.engine import DecoderEngine
 from nbavatar.methods.billboards.refine import Refinement
@@ -48,11 +48,17 @@ class Architecture:
     roi_margin: float
     order: str
     unet_form: str = "paper"  # what files hold that were written before there was another
+    normals: bool = False  # in files of before, too
+
+    @property
+    def decoded_channels(self) -> int:
+        """Channels that the U-Net takes: features, normals where it sees them, alpha."""
+        return self.channels + (3 if self.normals else 0) + 1
 
     def renderer(self) -> UNet:
         """The U-Net of these numbers, its weights still random."""
         return UNet(
-            self.channels + 1, width=self.unet_width, depth=self.unet_depth, max_width=self.unet_max_width,
+            self.decoded_channels, width=self.unet_width, depth=self.unet_depth, max_width=self.unet_max_width,
             convs=self.unet_convs, form=self.unet_form,
         )  # fmt: skip
 
@@ -80,7 +86,7 @@ class Window(NamedTuple):
         colour: I_R (without deferred rendering: colour divided by opacity), (3, h, w).
         alpha: I_alpha, (h, w).
         nb_alpha: opacity of the rasterized billboards I_alpha^NB, (h, w).
-        features: premultiplied features I_f^NB, (C, h, w).
+        features: premultiplied features I_f^NB (C, h, w); where the decoder sees normals, those too (C + 3, h, w).
         region: where the window lies.
     """
 
@@ -195,6 +201,7 @@ class Avatar(MeshAvatar):
         features, alpha = self.textures()
         if keep is not None:
             features, alpha = features[keep], alpha[keep]
+        features = self.drawn(features, posed)
         region = full_region(width, height, self.multiple)
         if a.roi if roi is None else roi:
             region = region_of(posed, viewmat, K, width, height, multiple=self.multiple, margin=a.roi_margin)
@@ -218,6 +225,10 @@ class Avatar(MeshAvatar):
         features = self.billboards.features
         return (features if self.unet is not None else torch.sigmoid(features)), self.billboards.alpha()
 
+    def drawn(self, features: Tensor, posed: Posed) -> Tensor:
+        """What is rasterized for the decoder: features (F, T, T, C), with normals behind them where it sees those."""
+        return with_normals(features, posed.normals) if self.architecture.normals else features
+
     def use_engine(self, kind: str) -> str:
         """See `MeshAvatar.use_engine`."""
         self.engine = None if kind == EAGER or self.unet is None else DecoderEngine(kind)
@@ -226,7 +237,10 @@ class Avatar(MeshAvatar):
     def decode(
         self, features: Tensor, nb_alpha: Tensor, precision: str = "fp32", *, engine: bool = True
     ) -> tuple[Tensor, Tensor]:
-        """Colour I_R (3, h, w) and opacity I_alpha (h, w) from rasterized features (C, h, w) and alpha (h, w)."""
+        """Colour I_R (3, h, w) and opacity I_alpha (h, w) from rasterized features and alpha (h, w).
+
+        Features are those of `Window.features`.
+        """
         if self.unet is None:
             return features / nb_alpha.clamp_min(1e-6), nb_alpha
         stacked = torch.cat((features, nb_alpha[None]))[None].contiguous(memory_format=torch.channels_last)
@@ -234,7 +248,7 @@ class Avatar(MeshAvatar):
         return colour[0], opacity[0, 0]
 
     def run_unet(self, stacked: Tensor, precision: str = "fp32", *, engine: bool = True) -> tuple[Tensor, Tensor]:
-        """`UNet.forward` of features and alpha (1, C+1, h, w), by the engine where it may and can."""
+        """`UNet.forward` of what it takes (1, `decoded_channels`, h, w), by the engine where it may and can."""
         assert self.unet is not None
         if precision == "fp32":
             if engine and self.engine is not None and self.engine.takes(stacked, self.unet):
@@ -300,18 +314,19 @@ class Avatar(MeshAvatar):
             if keep is not None:
                 features, alpha = features[keep], alpha[keep]
             window = self.window(posed, keep, viewmat, K, width, height)
+            drawn = self.drawn(features, posed)
             rgb = features[..., [min(i, features.shape[-1] - 1) for i in range(3)]].contiguous()
         region = window.region
 
         def raster(values: Tensor) -> Callable[[], Any]:
             return lambda: render_billboards(
-                *posed, values, alpha, viewmat, shift_camera(K, region), region.width, region.height,
+                *posed.planes, values, alpha, viewmat, shift_camera(K, region), region.width, region.height,
                 order=self.architecture.order,
             )  # fmt: skip
 
         calls: dict[str, Callable[[], Any]] = {
             "pose": lambda: self.pose(verts),
-            "raster": raster(features),
+            "raster": raster(drawn),
             "raster_rgb": raster(rgb),
             "compose": lambda: compose(window.colour, window.alpha, background),
         }

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from nbavatar.math.rotations import matrix_to_quaternion, normalize_quaternion, quaternion_multiply
 from nbavatar.mesh.frames import FaceFrames
 
-__all__ = ["Billboards", "Posed", "gaussian_alpha_logits", "initial_half_extents"]
+__all__ = ["Billboards", "Posed", "gaussian_alpha_logits", "initial_half_extents", "with_normals"]
 
 # Faces whose box would be thinner than this fraction of its longer side get this fraction: slivers stay visible.
 _THINNEST = 0.1
@@ -28,11 +28,24 @@ _LOG_SCALE_RANGE = (-12.0, 4.0)
 
 
 class Posed(NamedTuple):
-    """Billboards in world space: means [m] (F, 3), unit quats wxyz (F, 4), half_extents [m] (F, 2)."""
+    """Billboards in world space.
+
+    Attributes:
+        means: (F, 3) [m].
+        quats: unit quaternions wxyz (F, 4).
+        half_extents: (F, 2) [m].
+        normals: unit normals of their faces (F, 3), without gradients.
+    """
 
     means: Tensor
     quats: Tensor
     half_extents: Tensor
+    normals: Tensor
+
+    @property
+    def planes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """What the rasterizer takes: means, quats, half_extents."""
+        return self.means, self.quats, self.half_extents
 
 
 class Billboards(nn.Module):
@@ -83,11 +96,22 @@ class Billboards(nn.Module):
         scale = frames.k[:, None]
         means = torch.einsum("fij,fj->fi", frames.R, mu) * scale + frames.T
         quats = quaternion_multiply(anchor, normalize_quaternion(quat))
-        return Posed(means, quats, scale * log_scale.clamp(*_LOG_SCALE_RANGE).exp())
+        half_extents = scale * log_scale.clamp(*_LOG_SCALE_RANGE).exp()
+        # A mesh that is refined moves to where it is seen, not to be lit.
+        return Posed(means, quats, half_extents, frames.R[..., 2].detach())
 
     def alpha(self) -> Tensor:
         """Opacity textures in [0, 1], (F, T, T)."""
         return torch.sigmoid(self.alpha_logit)
+
+
+def with_normals(features: Tensor, normals: Tensor) -> Tensor:
+    """Textures (F, T, T, C) with the normals (F, 3) as three more channels, equal in all texels of a billboard.
+
+    Not part of the paper. Where light stands still, how bright a surface is depends on its direction in the world, and
+    a texture that turns with the mesh cannot say so.
+    """
+    return torch.cat((features, normals[:, None, None].expand(*features.shape[:-1], 3)), dim=-1)
 
 
 def initial_half_extents(verts: Tensor, faces: Tensor, frames: FaceFrames, *, margin: float) -> Tensor:

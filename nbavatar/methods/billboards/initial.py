@@ -71,6 +71,7 @@ def initial_avatar(
             unet_max_width=options.unet.max_width,
             unet_convs=options.unet.convs,
             unet_form=options.unet.form,
+            normals=options.deferred and options.normals,
             roi=options.roi,
             roi_margin=options.roi_margin,
             order=options.order,

@@ -57,6 +57,11 @@ class BillboardsConfig:
     channels: int = option(6, "Feature channels C of the neural textures.", min=1, max=64)
     texels: int = option(16, "Texels a side T of every texture.", min=1, max=64)
     deferred: bool = option(True, "Decode features by the U-Net; false: billboards hold RGB (ablation 'w/o DNR').")
+    normals: bool = option(
+        False,
+        "The U-Net also sees the normal of each billboard's face in the world: it learns how a light that stands "
+        "still shades what turns; not part of the paper.",
+    )
     init: str = option("spectral", "Initial features.", choices=("spectral", "random"))
     unet: UNetConfig = option(UNetConfig, "The deferred renderer.")
     extent_margin: float = option(1.5, "Half extents at the start, in boxes around the triangle.", min=0.1)

@@ -11,7 +11,7 @@ from nbavatar.methods.billboards.avatar import Architecture, Avatar
 
 __all__ = ["take_over"]
 
-_UNET = ("channels", "unet_width", "unet_depth", "unet_max_width", "unet_convs", "unet_form")
+_UNET = ("channels", "normals", "unet_width", "unet_depth", "unet_max_width", "unet_convs", "unet_form")
 _PLACES = ("mu", "quat", "log_scale")
 
 

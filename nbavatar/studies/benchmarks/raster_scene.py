@@ -98,7 +98,7 @@ def make_scene(
     if count == len(faces):
         model = Billboards(extents, features, logits)
         posed = model.pose(frames)
-        means, quats, half_extents = (tensor.detach() for tensor in posed)
+        means, quats, half_extents = (tensor.detach() for tensor in posed.planes)
     else:
         corners = verts[faces]
         areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1)

@@ -145,7 +145,8 @@ def _parts(scene: StepScene, crop: int) -> dict[str, Callable[[], None]]:
     side = sample.width
     view, K = sample.view.viewmat.to(device), sample.K.to(device)
     posed, _ = avatar.pose(verts, FRAME)
-    fixed = [value.detach().requires_grad_(True) for value in (*posed, *avatar.textures())]
+    textures, cover = avatar.textures()
+    fixed = [value.detach().requires_grad_(True) for value in (*posed.planes, avatar.drawn(textures, posed), cover)]
     region = full_region(side, side, avatar.multiple)
     stored = (sample.pixels.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
 
@@ -178,7 +179,7 @@ def _parts(scene: StepScene, crop: int) -> dict[str, Callable[[], None]]:
     def regularise() -> None:
         placed, _ = avatar.pose(verts, FRAME)
         assert method.neighbours is not None
-        (loss_knn(*placed, method.neighbours) + loss_delta(avatar.billboards.mu)).backward()
+        (loss_knn(*placed.planes, method.neighbours) + loss_delta(avatar.billboards.mu)).backward()
 
     def compare() -> None:
         (options.weight_l1 * loss_l1(picture, target) + options.weight_dssim * loss_dssim(picture, target)).backward()

@@ -188,7 +188,7 @@ def _region(case: Level) -> Sample:
         means = means * 0
     elif case == "of 1e6 m":
         extents = extents * 2e7
-    posed = Posed(means, torch.tensor([[1.0, 0, 0, 0]]).expand(len(means), 4), extents)
+    posed = Posed(means, torch.tensor([[1.0, 0, 0, 0]]).expand(len(means), 4), extents, torch.zeros_like(means))
     K = torch.tensor([[100.0, 0, 64], [0, 100.0, 48], [0, 0, 1]])
     box = visible_box(posed, torch.eye(4), K, 128, 96)
     region = region_of(posed, torch.eye(4), K, 128, 96, multiple=32, margin=0.1)

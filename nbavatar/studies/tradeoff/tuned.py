@@ -286,8 +286,8 @@ class TunedAvatar:
         self.work.raster_pixels += region.width * region.height
         self.work.texels += alpha.numel()
         return render_billboards(
-            *posed, features, alpha, viewmat, shift_camera(K, region), region.width, region.height,
-            order=s.order or scene.avatar.architecture.order, alpha_min=s.alpha_min, t_min=s.t_min,
+            *posed.planes, scene.avatar.drawn(features, posed), alpha, viewmat, shift_camera(K, region), region.width,
+            region.height, order=s.order or scene.avatar.architecture.order, alpha_min=s.alpha_min, t_min=s.t_min,
             low_pass=s.low_pass,
         )  # fmt: skip
 

@@ -100,7 +100,7 @@ def test_l1_and_dssim_are_those_of_the_whole_picture_whatever_the_window_and_the
     background = torch.rand(3, generator=torch.Generator().manual_seed(3)).double().numpy()[:, None, None]
     posed, _ = avatar.place(anchor)
     features, opacity = avatar.textures()
-    colour, alpha = render_billboards(*posed, features, opacity, viewmat, K, width, height)
+    colour, alpha = render_billboards(*posed.planes, features, opacity, viewmat, K, width, height)
     image = colour.detach().double().numpy() + (1 - alpha.detach().double().numpy()) * background
     planes = pixels.double().numpy()
     truth = planes[:3] + (1 - planes[3]) * background

@@ -28,7 +28,7 @@ def contributions(
         order: compositing order.
     """
     ones = torch.ones(*alpha.shape, 1, dtype=alpha.dtype, device=alpha.device, requires_grad=True)
-    tensors = [tensor.detach() for tensor in (*posed, alpha, viewmat, K)]
+    tensors = [tensor.detach() for tensor in (*posed.planes, alpha, viewmat, K)]
     means, quats, half_extents, alpha, viewmat, K = tensors
     with torch.enable_grad():
         image, _ = render_billboards(means, quats, half_extents, ones, alpha, viewmat, K, width, height, order=order)

@@ -37,6 +37,7 @@ def test_pose_is_equivariant_under_similarity(turn: tuple, shift: tuple, scale: 
     after = board.pose(face_frames(scale * VERTS @ rotation.T + offset, FACES))
     torch.testing.assert_close(after.means, scale * before.means @ rotation.T + offset, atol=1e-9, rtol=1e-9)
     torch.testing.assert_close(after.half_extents, scale * before.half_extents)
+    torch.testing.assert_close(after.normals, before.normals @ rotation.T, atol=1e-9, rtol=0)
     turned = rotation @ quaternion_to_matrix(before.quats)
     torch.testing.assert_close(quaternion_to_matrix(after.quats), turned, atol=1e-9, rtol=0)
 
@@ -83,7 +84,7 @@ def test_pose_survives_runaway_scales_and_zero_quaternions() -> None:
         board.log_scale.fill_(1e6)
         board.quat.zero_()
     posed = board.pose(face_frames(VERTS, FACES))
-    assert all(torch.isfinite(value).all() for value in posed)
+    assert all(torch.isfinite(value).all() for value in posed.planes)
     torch.testing.assert_close(posed.quats.norm(dim=1), torch.ones(4, dtype=torch.float64))
 
 
@@ -93,7 +94,7 @@ def test_pose_gradients_agree_with_finite_differences() -> None:
 
     def posed(mu, quat, log_scale):
         values = torch.func.functional_call(board, {"mu": mu, "quat": quat, "log_scale": log_scale}, (frames,))
-        return tuple(values)
+        return values.planes
 
     board.forward = board.pose  # functional_call goes through forward
     assert torch.autograd.gradcheck(posed, (board.mu, board.quat, board.log_scale))

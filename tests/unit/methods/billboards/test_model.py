@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from nbavatar.errors import DataError
+from nbavatar.math.rotations import axis_angle_to_matrix
 from nbavatar.methods.base import compose
 from nbavatar.methods.billboards.avatar import Architecture, Avatar
 from nbavatar.methods.billboards.billboards import Billboards
@@ -23,13 +24,15 @@ VERTS = {
 }
 
 
-def make_avatar(*, deferred: bool = True, refinement: Refinement | None = None, roi: bool = True) -> Avatar:
+def make_avatar(
+    *, deferred: bool = True, refinement: Refinement | None = None, roi: bool = True, normals: bool = False
+) -> Avatar:
     """An untrained avatar with random values everywhere."""
     torch.manual_seed(3)
     faces = {"head": torch.from_numpy(OCTAHEDRON_FACES), "right_hand": torch.from_numpy(TETRAHEDRON_FACES)}
     channels = 4 if deferred else 3
     billboards = Billboards(torch.full((12, 2), 0.7), torch.randn(12, 4, 4, channels), torch.randn(12, 4, 4))
-    architecture = Architecture(channels, 4, deferred, 4, 3, 16, 1, roi, 0.1, "ray")
+    architecture = Architecture(channels, 4, deferred, 4, 3, 16, 1, roi, 0.1, "ray", normals=normals)
     counts = {"head": 6, "right_hand": 4}
     return Avatar(architecture, faces, counts, billboards, refinement=refinement, record={"command": "test"}).eval()
 
@@ -214,11 +217,31 @@ def test_importing_the_model_loads_nothing_heavy() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_a_decoder_that_sees_normals_is_told_how_the_head_is_turned(tmp_path) -> None:
+    """Head and camera turned together: the same billboards in the picture, their normals turned."""
+    turn = torch.eye(4)
+    turn[:3, :3] = axis_angle_to_matrix(torch.tensor([0.3, 2.0, -0.5]))
+    turned = {part: points @ turn[:3, :3].T for part, points in VERTS.items()}
+    avatar = make_avatar(normals=True)
+    with torch.no_grad():
+        still = avatar.window(*avatar.pose(VERTS), VIEW, K, 33, 30, roi=False)
+        moved = avatar.window(*avatar.pose(turned), VIEW @ turn.T, K, 33, 30, roi=False)
+    assert still.features.shape[0] == 4 + 3
+    expected = torch.cat((still.features[:4], torch.einsum("ij,jhw->ihw", turn[:3, :3], still.features[4:])))
+    off = (moved.features - expected).abs().amax(0) > 1e-3
+    assert off.float().mean() < 0.05  # where symmetric billboards cross, rounding decides which one is in front
+    assert (moved.features[4:] - still.features[4:]).abs().max() > 0.5
+    save_avatar(tmp_path / "model.pt", avatar)
+    for a, b in zip(render(avatar), render(load_avatar(tmp_path / "model.pt")), strict=True):
+        assert torch.equal(a, b)
+
+
 def test_files_from_before_there_were_forms_hold_the_papers(tmp_path) -> None:
     avatar = make_avatar()
     save_avatar(tmp_path / "model.pt", avatar)
     content = torch.load(tmp_path / "model.pt", weights_only=True)
     assert content["architecture"].pop("unet_form") == "paper"
+    assert content["architecture"].pop("normals") is False
     torch.save(content, tmp_path / "model.pt")
     for a, b in zip(render(avatar), render(load_avatar(tmp_path / "model.pt")), strict=True):
         assert torch.equal(a, b)

@@ -17,7 +17,7 @@ def _posed(count: int, seed: int, depth: float = 2.0, spread: float = 0.3) -> Po
     generator = torch.Generator().manual_seed(seed)
     means = spread * torch.randn(count, 3, generator=generator) + torch.tensor([0.0, 0.0, depth])
     quats = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=1)
-    return Posed(means, quats, 0.02 + 0.1 * torch.rand(count, 2, generator=generator))
+    return Posed(means, quats, 0.02 + 0.1 * torch.rand(count, 2, generator=generator), torch.zeros_like(means))
 
 
 @given(st.integers(0, 10_000), st.floats(0.1, 3.0), st.sampled_from([1, 8, 32]))
@@ -26,7 +26,9 @@ def test_region_contains_all_coverage(seed: int, depth: float, multiple: int) ->
     width, height = 72, 56
     region = region_of(posed, VIEW, K, width, height, multiple=multiple, margin=0.0)
     assert region.width % multiple == 0 and region.height % multiple == 0
-    _, alpha = render_billboards(*posed, None, torch.full((6, 4, 4), 0.9), VIEW, K, width, height, backend="reference")
+    _, alpha = render_billboards(
+        *posed.planes, None, torch.full((6, 4, 4), 0.9), VIEW, K, width, height, backend="reference"
+    )
     rows, columns, _, _ = region.overlap(width, height)
     inside = torch.zeros_like(alpha)
     inside[rows, columns] = 1.0
@@ -37,9 +39,9 @@ def test_region_rendering_equals_the_cut_of_the_whole() -> None:
     posed = _posed(6, 3)
     region = region_of(posed, VIEW, K, 96, 64, multiple=8, margin=0.1)
     features, alpha = torch.randn(6, 4, 4, 2), torch.rand(6, 4, 4)
-    whole, _ = render_billboards(*posed, features, alpha, VIEW, K, 96, 64, backend="reference")
+    whole, _ = render_billboards(*posed.planes, features, alpha, VIEW, K, 96, 64, backend="reference")
     window, _ = render_billboards(
-        *posed, features, alpha, VIEW, shift_camera(K, region), region.width, region.height, backend="reference"
+        *posed.planes, features, alpha, VIEW, shift_camera(K, region), region.width, region.height, backend="reference"
     )
     torch.testing.assert_close(paste(window, region, 96, 64), whole, atol=1e-4, rtol=0)
 
@@ -51,7 +53,8 @@ def test_region_of_nothing_visible_is_one_tile() -> None:
 
 
 def test_region_at_the_near_plane_is_the_whole_picture() -> None:
-    close = Posed(torch.tensor([[0.0, 0, 0.02]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[0.1, 0.1]]))
+    middle = torch.tensor([[0.0, 0, 0.02]])
+    close = Posed(middle, torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[0.1, 0.1]]), torch.zeros_like(middle))
     assert region_of(close, VIEW, K, 70, 40, multiple=32, margin=0.0) == full_region(70, 40, 32) == Region(0, 0, 96, 64)
 
 

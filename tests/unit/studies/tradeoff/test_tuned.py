@@ -37,13 +37,13 @@ VERTS = {
 }
 
 
-def make_avatar(*, deferred: bool = True, texels: int = 4) -> Avatar:
+def make_avatar(*, deferred: bool = True, texels: int = 4, normals: bool = False) -> Avatar:
     torch.manual_seed(3)
     faces = {"head": torch.from_numpy(OCTAHEDRON_FACES), "right_hand": torch.from_numpy(TETRAHEDRON_FACES)}
     channels = 4 if deferred else 3
     features, logits = torch.randn(12, texels, texels, channels), torch.randn(12, texels, texels)
     billboards = Billboards(torch.full((12, 2), 0.7), features, logits)
-    architecture = Architecture(channels, texels, deferred, 4, 3, 16, 1, True, 0.1, "ray")
+    architecture = Architecture(channels, texels, deferred, 4, 3, 16, 1, True, 0.1, "ray", normals=normals)
     return Avatar(architecture, faces, {"head": 6, "right_hand": 4}, billboards).eval()
 
 
@@ -52,10 +52,10 @@ def picture(avatar, verts=VERTS, *, K=K, viewmat=VIEW, size=(SIZE, SIZE)) -> tor
         return avatar.render(verts, viewmat, K, *size, BACKGROUND)[0]
 
 
-@pytest.mark.parametrize("deferred", [True, False])
+@pytest.mark.parametrize(("deferred", "normals"), [(True, False), (True, True), (False, False)])
 @pytest.mark.parametrize("size", [(64, 64), (50, 37)])
-def test_the_default_setting_is_the_avatar_bit_by_bit(deferred: bool, size: tuple[int, int]) -> None:
-    avatar = make_avatar(deferred=deferred)
+def test_the_default_setting_is_the_avatar_bit_by_bit(deferred: bool, normals: bool, size: tuple[int, int]) -> None:
+    avatar = make_avatar(deferred=deferred, normals=normals)
     with torch.no_grad():
         expected = avatar.render(VERTS, VIEW, K, *size, BACKGROUND)
     given = TunedAvatar(avatar, SettingConfig()).render(VERTS, VIEW, K, *size, BACKGROUND)
@@ -139,7 +139,7 @@ def test_rasterizer_options_reach_the_rasterizer() -> None:
     tuned = TunedAvatar(avatar, vary(SettingConfig(roi=False), options))
     posed, _ = avatar.pose(VERTS)
     features, alpha = avatar.textures()
-    image, opacity = render_billboards(*posed, features, alpha, VIEW, K, SIZE, SIZE, **options)
+    image, opacity = render_billboards(*posed.planes, features, alpha, VIEW, K, SIZE, SIZE, **options)
     expected = image + (1 - opacity) * BACKGROUND[:, None, None]
     torch.testing.assert_close(picture(tuned), expected.detach(), atol=1e-5, rtol=0)
 
@@ -153,7 +153,7 @@ def test_contributions_are_what_removing_other_colours_shows() -> None:
     for index in range(12):
         paint = torch.zeros(*alpha.shape, 1)
         paint[index] = 1
-        image, _ = render_billboards(*posed, paint, alpha, VIEW, K, SIZE, SIZE)
+        image, _ = render_billboards(*posed.planes, paint, alpha, VIEW, K, SIZE, SIZE)
         assert float(given[index]) == pytest.approx(float(image.detach().sum()), abs=2e-3)
 
 
@@ -235,7 +235,7 @@ def test_texels_needed_by_hand() -> None:
     count = 10
     means = torch.tensor([0.0, 0, 2]).expand(count, 3)
     extents = torch.full((count, 2), 0.01)
-    posed = Posed(means, torch.tensor([1.0, 0, 0, 0]).expand(count, 4), extents)
+    posed = Posed(means, torch.tensor([1.0, 0, 0, 0]).expand(count, 4), extents, torch.zeros_like(means))
     camera = torch.tensor([[1000.0, 0, 0], [0, 1000.0, 0], [0, 0, 1]])
     # 0.01 m at 2 m and f = 1000 px is 5 px of half extent: 10 px from first to last texel centre.
     assert texels_needed(posed, torch.eye(4), camera) == 11
