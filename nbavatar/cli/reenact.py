@@ -11,7 +11,8 @@
 A shell (`nbavatar shell`) rides on the head in its new poses. Hands are shifted so that they touch the source's head
 where they touched the target's (see --free-hands). Contact that is deeper than the skin is the work of `nbavatar
 deform --meshes OUT`. Frames of the result are nobody's training frames: no refinement of training frames is applied
-to them.
+to them. Directions are those of the target's world, and avatars of captures have learnt how light falls in their own:
+both should have the same axis up.
 """
 
 import argparse
