@@ -177,14 +177,17 @@ def _parts(scene: StepScene, crop: int) -> dict[str, Callable[[], None]]:
         avatar.place(avatar.anchor(verts, FRAME))[0].means.sum().backward()
 
     def regularise() -> None:
-        placed, _ = avatar.pose(verts, FRAME)
-        assert method.neighbours is not None
-        (loss_knn(*placed.planes, method.neighbours) + loss_delta(avatar.billboards.mu)).backward()
+        loss = loss_delta(avatar.billboards.mu)
+        if method.neighbours is not None:
+            loss = loss + loss_knn(*avatar.pose(verts, FRAME)[0].planes, method.neighbours)
+        loss.backward()
 
     def compare() -> None:
         (options.weight_l1 * loss_l1(picture, target) + options.weight_dssim * loss_dssim(picture, target)).backward()
 
-    parts = {"data": data, "meshes": meshes, "raster": draw, "unet": decode, "regularisers": regularise}
+    parts = {"data": data, "meshes": meshes, "raster": draw, "unet": decode}
+    if method.neighbours is not None or options.weight_delta > 0:
+        parts["regularisers"] = regularise
     if options.weight_dssim > 0:
         picture, target = torch.rand((3, side, side), device=device, requires_grad=True), sample.pixels[:3].to(device)
         parts["colours"] = compare
