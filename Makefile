@@ -64,7 +64,7 @@ lint: install  ## formatting, style, types, layers, workflow
 	$(BIN)/ruff format --check .
 	$(BIN)/snakefmt --check Snakefile workflow
 	$(BIN)/lint-imports
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/snakemake --lint --configfile config/smoke.yaml
 
 format: install  ## format Python and Snakemake files

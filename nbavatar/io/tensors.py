@@ -204,7 +204,7 @@ def _persistent(pid: Any) -> tuple[_Kind, str, int]:
 
 def _filled(stream: Any, dtype: torch.dtype, count: int) -> _Storage:
     flat = torch.zeros(count, dtype=torch.uint8 if dtype is torch.bool else dtype)
-    memory = memoryview(flat.view(torch.uint8).numpy()).cast("B")
+    memory = flat.view(torch.uint8).numpy().data.cast("B")
     done = 0
     while done < len(memory):
         got = stream.readinto(memory[done:])

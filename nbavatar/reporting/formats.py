@@ -5,6 +5,8 @@ csv         one line a cell: block, row, column, shown text, exact value, mark, 
 Markdown    **best**, <u>second</u>, missing cells as an em dash
 LaTeX       a snippet to \\input; needs booktabs, graphicx, subcaption and, for shading, xcolor with option table
 """
+# pyright: reportArgumentType=false, reportReturnType=false
+# The stubs of pandas take a column for a table and know one kind of key.
 
 import json
 import re

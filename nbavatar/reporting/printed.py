@@ -2,6 +2,8 @@
 
 Values stay text: "0.9711" and "0.976" have different precisions, and both are shown as printed.
 """
+# pyright: reportArgumentType=false, reportReturnType=false
+# The stubs of pandas take a column for a table and know one kind of key.
 
 import csv
 import re

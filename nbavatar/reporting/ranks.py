@@ -2,6 +2,8 @@
 
 Equal digits get equal marks, and two best leave no second: a reader can check every mark from the table alone.
 """
+# pyright: reportArgumentType=false, reportReturnType=false
+# The stubs of pandas take a column for a table and know one kind of key.
 
 import numpy as np
 import pandas as pd

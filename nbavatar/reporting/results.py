@@ -24,6 +24,8 @@ In a notebook (identifiers stay text):
 
     results = pandas.read_csv("results/paper/results.csv", dtype={name: str for name in ("subject", "view", "frame")})
 """
+# pyright: reportArgumentType=false, reportReturnType=false
+# The stubs of pandas take a column for a table and know one kind of key.
 
 from collections.abc import Mapping, Sequence
 from typing import Any

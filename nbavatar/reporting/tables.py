@@ -8,6 +8,8 @@ subjects, and are missing unless every subject is there.
 All cells of a table are one data frame (``nbavatar.reporting.cells.Table``). Each names the number that it shows by
 subject, variant, protocol and metric; numbers of no single subject, that is means and timings, have the subject ``""``.
 """
+# pyright: reportArgumentType=false, reportReturnType=false
+# The stubs of pandas take a column for a table and know one kind of key.
 
 import math
 from collections.abc import Sequence
