@@ -61,7 +61,8 @@ def avatar(folder: Path, method: str) -> Path:
 
 
 def _avatar(method: str) -> Any:
-    from nbavatar.methods.billboards.avatar import Architecture, Avatar
+    from nbavatar.methods.billboards.architecture import Architecture
+    from nbavatar.methods.billboards.avatar import Avatar
     from nbavatar.methods.billboards.billboards import Billboards
     from nbavatar.methods.billboards.refine import Refinement
     from nbavatar.methods.gaussian_avatars.avatar import GaussianAvatars

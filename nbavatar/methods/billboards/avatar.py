@@ -19,48 +19,18 @@ from nbavatar.config.evaluation import EAGER
 from nbavatar.math.rotations import matrix_to_quaternion
 from nbavatar.mesh.frames import FaceFrames, face_frames
 from nbavatar.methods.base import MeshAvatar, Stages, compose
+from nbavatar.methods.billboards.architecture import Architecture, check_stored
 from nbavatar.methods.billboards.billboards import Billboards, Posed, with_normals
 from nbavatar.methods.billboards.compression.sized import SizedBillboards
 from nbavatar.methods.billboards.engine import DecoderEngine
 from nbavatar.methods.billboards.refine import Refinement
 from nbavatar.methods.billboards.region import Region, full_region, paste, region_of, shift_camera
-from nbavatar.methods.billboards.unet import FORMS, UNet, macs
+from nbavatar.methods.billboards.unet import macs
 from nbavatar.rendering.billboards.functional import render_billboards
 
-__all__ = ["Anchor", "Architecture", "Avatar", "Window"]
+__all__ = ["Anchor", "Avatar", "Window"]
 
-_MOST_TEXELS, _DEEPEST = 64, 16  # the options allow no more
 _DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
-
-
-@dataclasses.dataclass(frozen=True)
-class Architecture:
-    """Numbers that fix an avatar's tensors and how it is rendered; see `nbavatar.config.training.TrainConfig`."""
-
-    channels: int
-    texels: int
-    deferred: bool
-    unet_width: int
-    unet_depth: int
-    unet_max_width: int
-    unet_convs: int
-    roi: bool
-    roi_margin: float
-    order: str
-    unet_form: str = "paper"  # what files hold that were written before there was another
-    normals: bool = False  # in files of before, too
-
-    @property
-    def decoded_channels(self) -> int:
-        """Channels that the U-Net takes: features, normals where it sees them, alpha."""
-        return self.channels + (3 if self.normals else 0) + 1
-
-    def renderer(self) -> UNet:
-        """The U-Net of these numbers, its weights still random."""
-        return UNet(
-            self.decoded_channels, width=self.unet_width, depth=self.unet_depth, max_width=self.unet_max_width,
-            convs=self.unet_convs, form=self.unet_form,
-        )  # fmt: skip
 
 
 class Anchor(NamedTuple):
@@ -364,7 +334,7 @@ class Avatar(MeshAvatar):
     def rebuild(cls, content: Mapping[str, Any], state: Mapping[str, Tensor], record: Mapping[str, Any]) -> "Avatar":
         """An avatar of the stored shape, its values still to be loaded."""
         architecture = Architecture(**content["architecture"])
-        _check_stored(architecture, content["refinement"], state)
+        check_stored(architecture, content["refinement"], state)
         if "billboards.sizes" in state:
             billboards = SizedBillboards.of_state(architecture.texels, state, "billboards.")
         else:
@@ -381,28 +351,6 @@ class Avatar(MeshAvatar):
             refinement=_empty_refinement(content["refinement"], state),
             record=record,
         )
-
-
-def _check_stored(a: Architecture, refinement: Mapping[str, Any] | None, state: Mapping[str, Tensor]) -> None:
-    """Compares the sizes that a file names with the tensors that are there, before anything is made of such a size.
-
-    Raises:
-        ValueError: they disagree.
-    """
-    if not (0 < a.texels <= _MOST_TEXELS and 0 < a.unet_depth <= _DEEPEST and 0 < a.unet_convs <= _DEEPEST):
-        raise ValueError(f"{a.texels} texels, {a.unet_depth} stages of {a.unet_convs} convolutions")
-    if a.unet_form not in FORMS:
-        raise ValueError(f"a U-Net of the form {a.unet_form!r}")
-    if a.deferred:
-        with torch.device("meta"):  # shapes without memory
-            unet = a.renderer()
-        for name, value in unet.state_dict().items():
-            if state[f"unet.{name}"].shape != value.shape:
-                raise ValueError(f"unet.{name} of {list(state[f'unet.{name}'].shape)} instead of {list(value.shape)}")
-    if refinement is not None:
-        for name, value in state.items():
-            if name.startswith("refinement.bend_") and len(value) != len(refinement["frames"]):
-                raise ValueError(f"{name} of {len(value)} frames instead of {len(refinement['frames'])}")
 
 
 def _empty_refinement(described: Mapping[str, Any] | None, state: Mapping[str, Tensor]) -> Refinement | None:

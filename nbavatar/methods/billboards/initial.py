@@ -12,7 +12,8 @@ from nbavatar.errors import DataError
 from nbavatar.mesh.frames import face_frames
 from nbavatar.mesh.texels import texel_values
 from nbavatar.methods.base import modelled_parts
-from nbavatar.methods.billboards.avatar import Architecture, Avatar
+from nbavatar.methods.billboards.architecture import Architecture
+from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.billboards import Billboards, gaussian_alpha_logits, initial_half_extents
 from nbavatar.methods.billboards.losses import knn_graph
 from nbavatar.methods.billboards.options import BillboardsConfig

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 
 from nbavatar.methods.base import Taken
-from nbavatar.methods.billboards.avatar import Architecture, Avatar
+from nbavatar.methods.billboards.architecture import Architecture
+from nbavatar.methods.billboards.avatar import Avatar
 
 __all__ = ["take_over"]
 

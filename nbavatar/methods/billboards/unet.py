@@ -102,7 +102,7 @@ class UNet(nn.Module):
         super().__init__()
         self.lean = form == "lean"
         widths = [min(width * 2**level, max_width) for level in range(depth + 1)]
-        self.multiple = 2**depth
+        self.channels, self.multiple = channels, 2**depth
         self.stem = _stage(channels, widths[0], norm=False)
         self.down = nn.ModuleList(_stage(widths[i], widths[i + 1], stride=2, convs=convs) for i in range(depth))
         lift = _Lift if self.lean else _stage

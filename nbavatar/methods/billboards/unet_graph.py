@@ -103,8 +103,7 @@ def unet_graph(unet: UNet) -> bytes:
     else:
         graph.add("Sigmoid", graph.layer(unet.colour, value), output="colour")
         graph.add("Sigmoid", graph.layer(unet.opacity, value), output="opacity")
-    channels = unet.stem[0].weight.shape[1]
-    inputs = [helper.make_tensor_value_info("features", kind, [1, channels, "H", "W"])]
+    inputs = [helper.make_tensor_value_info("features", kind, [1, unet.channels, "H", "W"])]
     outputs = [
         helper.make_tensor_value_info(name, kind, [1, count, "H", "W"])
         for name, count in (("colour", 3), ("opacity", 1))

@@ -79,9 +79,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
 
 def _turns(unet: UNet, engines: dict[str, DecoderEngine], side: int, repeats: int) -> dict[str, float]:
     """Figures of one size."""
-    weight = unet.stem[0].weight
-    assert isinstance(weight, Tensor)
-    features = torch.randn(1, weight.shape[1], side, side)
+    features = torch.randn(1, unet.channels, side, side)
     features = features.contiguous(memory_format=torch.channels_last)
     calls: dict[str, Callable[[int], tuple[Tensor, Tensor]]] = {"eager": lambda _: unet(features)}
     calls |= {kind: lambda _, own=engine: own(unet, features) for kind, engine in engines.items()}

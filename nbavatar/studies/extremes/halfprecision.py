@@ -6,7 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nbavatar.methods.billboards.avatar import Architecture, Avatar
+from nbavatar.methods.billboards.architecture import Architecture
+from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.billboards import Billboards
 from nbavatar.studies.extremes.cells import Limit, Sample, cell
 from nbavatar.studies.extremes.compare import gradient_error, gradients, relative

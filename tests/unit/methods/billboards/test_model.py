@@ -9,7 +9,8 @@ import torch
 from nbavatar.errors import DataError
 from nbavatar.math.rotations import axis_angle_to_matrix
 from nbavatar.methods.base import compose
-from nbavatar.methods.billboards.avatar import Architecture, Avatar
+from nbavatar.methods.billboards.architecture import Architecture
+from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.billboards import Billboards
 from nbavatar.methods.billboards.refine import Refinement
 from nbavatar.methods.storage import load_avatar, save_avatar

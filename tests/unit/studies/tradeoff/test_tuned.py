@@ -7,7 +7,8 @@ from torch.nn import functional
 from nbavatar.config.tradeoff import SettingConfig, vary
 from nbavatar.data.views import View
 from nbavatar.errors import DataError
-from nbavatar.methods.billboards.avatar import Architecture, Avatar
+from nbavatar.methods.billboards.architecture import Architecture
+from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.billboards import Billboards, Posed
 from nbavatar.methods.billboards.compression.contribution import contributions, most_contributing
 from nbavatar.methods.billboards.compression.footprint import largest_footprints, texels_of
