@@ -33,6 +33,7 @@ VERBS = {
     "fit": "multi-view refit of head and hand models",
     "align": "rigid alignment of a capture's meshes to its pictures",
     "shell": "what the head's mesh lacks (hair), carved from the training masks",
+    "light": "the light of a capture's studio, from how skin changes as it turns",
     "spectral": "spectral coordinates of the meshes",
     "deform": "contact deformation of the head by the hand, cached to NPZ and EXR",
     "train": "train an avatar",

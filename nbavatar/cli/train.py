@@ -5,6 +5,8 @@
                 split is "train" are used
     --meshes    mesh sequence (.npz): faces, rest pose and posed vertices per part [m], world, one row a frame
     --spectral  spectral coordinates (.npz): `<part>.coords` float32 [V, K]
+    --light     far lights of the studio (.npz, `nbavatar light`), for billboards: what reaches each face is told to the
+                U-Net
     --start     model.pt of an earlier training or of another subject; what fits of it is taken over, part by part, and
                 a line says what does not
     --out       model.pt, one file; opens with torch.load(weights_only=True)
@@ -44,6 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--spectral", metavar="NPZ", help="spectral coordinates; needed for init=spectral and refinement"
     )
     parser.add_argument(
+        "--light", nargs="?", const="", metavar="NPZ", help="lights of the studio; with nothing after it, none"
+    )
+    parser.add_argument(
         "--start", nargs="?", const="", metavar="PT",
         help="avatar to start from, in place of the option `start`; with nothing after it, none",
     )  # fmt: skip
@@ -71,6 +76,8 @@ def main(args: argparse.Namespace) -> int:
     inputs = {f"frames.{i}": path for i, path in enumerate(args.frames)} | {"meshes": args.meshes}
     if args.spectral:
         inputs["spectral"] = args.spectral
+    if args.light:
+        inputs["light"] = args.light
     if config.start:
         inputs["start"] = config.start
     for name, path in inputs.items():
@@ -129,6 +136,7 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     # torch is imported after the device has been leased.
     import torch
 
+    from nbavatar.data.lights import read_light
     from nbavatar.data.sequences import read_sequence
     from nbavatar.data.views import ViewStore, check_views, views_of
     from nbavatar.io.framepack import FramePack
@@ -144,7 +152,8 @@ def _train(args: argparse.Namespace, config: TrainConfig, record: dict[str, Any]
     views = views_of(packs, sequence.frames, [pack.split("train") for pack in packs], layers=("rgb", "alpha"))
     posed = {part: mesh.verts for part, mesh in sequence.parts.items()}
     check_views(packs, views, posed, mesh_file=args.meshes)
-    method = create_method(sequence, coords, views, config, device)
+    light = read_light(args.light) if args.light else None
+    method = create_method(sequence, coords, views, config, device, light)
     avatar, net, lpips = method.avatar, method.lpips_net(), None
     if net is not None:
         from nbavatar.metrics.lpips import load_lpips

@@ -1,11 +1,11 @@
-"""Options of the geometry stages: refit, spectral coordinates, contact deformation."""
+"""Options of the geometry stages: refit, alignment, shell, light, spectral coordinates, contact deformation."""
 
 import dataclasses
 from typing import Any
 
 from nbavatar.config.core import option, to_mapping
 
-__all__ = ["AlignConfig", "DeformConfig", "FitConfig", "ShellConfig", "SpectralConfig"]
+__all__ = ["AlignConfig", "DeformConfig", "FitConfig", "LightConfig", "ShellConfig", "SpectralConfig"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,6 +105,26 @@ class ShellConfig:
     lines: int = option(512, "Height to which larger masks are reduced [px].", min=16, max=2160)
     faces: int = option(2000, "Most faces of the surface; fewer where they would be smaller than the mesh's.", min=8)
     picture_size: int = option(320, "Side of one view in the picture [px].", min=64, max=4096)
+
+
+@dataclasses.dataclass(frozen=True)
+class LightConfig:
+    """The light of a capture's studio, from how the brightness of skin changes between frames."""
+
+    lights: int = option(
+        0, "Most far lights that are kept, the strongest of those tried; 0 leaves the stage out.", min=0, max=4096
+    )
+    directions: int = option(256, "Lights that are tried, evenly spread over all directions.", min=8, max=4096)
+    least: float = option(
+        0.1, "Share of the change of brightness, in frames left out of the fit, that a light must explain to be kept.",
+        min=0.0, max=1.0,
+    )  # fmt: skip
+    frames: int = option(32, "Most training frames that are looked at, evenly spread.", min=1)
+    cameras: int = option(12, "Most cameras that are looked at, evenly spread.", min=1)
+    faces: int = option(6000, "Most faces that are looked at; bounds memory.", min=1)
+    lines: int = option(256, "Height to which larger pictures are reduced [px].", min=16, max=2160)
+    side: int = option(192, "Side of a shadow map, which the meshes fill [px].", min=16, max=4096)
+    picture_size: int = option(256, "Side of one tile in the picture [px].", min=64, max=4096)
 
 
 @dataclasses.dataclass(frozen=True)

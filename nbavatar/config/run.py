@@ -17,7 +17,7 @@ from nbavatar.config.evaluation import (
     TableConfig,
     VideoConfig,
 )
-from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, ShellConfig, SpectralConfig
+from nbavatar.config.geometry import AlignConfig, DeformConfig, FitConfig, LightConfig, ShellConfig, SpectralConfig
 from nbavatar.config.preprocess import CheckConfig, CropConfig, FramesConfig, IngestConfig, MasksConfig, TracksConfig
 from nbavatar.config.synthetic import SynthesizeConfig
 from nbavatar.config.training import TrainConfig, own_options
@@ -40,6 +40,7 @@ class Stages:
     fit: FitConfig = option(FitConfig, "Multi-view refit.")
     align: AlignConfig = option(AlignConfig, "Alignment of a capture's meshes to its pictures.")
     shell: ShellConfig = option(ShellConfig, "What the head's mesh of a capture lacks, such as hair.")
+    light: LightConfig = option(LightConfig, "The light of a capture's studio.")
     spectral: SpectralConfig = option(SpectralConfig, "Spectral coordinates.")
     deform: DeformConfig = option(DeformConfig, "Contact deformation.")
     train: TrainConfig = option(TrainConfig, "Training.")

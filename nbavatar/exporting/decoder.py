@@ -2,8 +2,10 @@
 
     input    features  float32 (1, C+1, H, W)   premultiplied features and the billboards' alpha (the last channel);
                                                 H and W multiples of 2^depth, and at least twice that. Where the
-                                                metadata says `normals`, (1, C+4, H, W): the faces' unit normals,
-                                                world, premultiplied too, between features and alpha
+                                                metadata says `normals`, three channels more: the faces' unit normals,
+                                                world, premultiplied too, between features and alpha; where it says
+                                                `shading`, one more behind them: 2 E^(1/2.2) - 1 of the light E on the
+                                                faces, premultiplied
     outputs  colour    float32 (1, 3, H, W)     I_R in [0, 1], sRGB
              opacity   float32 (1, 1, H, W)     I_alpha in [0, 1]
 
@@ -64,7 +66,7 @@ def decoder_model(avatar: MeshAvatar, record: dict[str, Any]) -> bytes:
     assert program is not None
     model = program.model_proto
     a = avatar.architecture
-    known = {"multiple": multiple, "channels": a.channels, "normals": a.normals, "export": record}
+    known = {"multiple": multiple, "channels": a.channels, "normals": a.normals, "shading": a.shading, "export": record}
     onnx.helper.set_model_props(model, {name: json.dumps(value, sort_keys=True) for name, value in known.items()})
     stream = io.BytesIO()
     onnx.save_model(model, stream)

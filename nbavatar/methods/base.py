@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from nbavatar.config.evaluation import EAGER
 from nbavatar.config.training import TrainConfig
+from nbavatar.data.lights import Light
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
 from nbavatar.errors import ConfigError, DataError
@@ -283,6 +284,7 @@ class Method(ABC):
         views: Sequence[View],
         config: TrainConfig,
         device: str,
+        light: Light | None = None,
     ) -> "Method":
         """The method with its avatar in its initial state; the same seed gives the same bits.
 
@@ -292,6 +294,7 @@ class Method(ABC):
             views: the training views.
             config: training options.
             device: where to compute.
+            light: of the studio, for methods that can use it; None where it is not known.
         """
 
     def take_over(self, other: MeshAvatar, parts: Sequence[str]) -> Taken:

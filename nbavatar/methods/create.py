@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from nbavatar.config.training import TrainConfig
+from nbavatar.data.lights import Light
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
 from nbavatar.methods.base import Method
@@ -19,7 +20,8 @@ def create_method(
     views: Sequence[View],
     config: TrainConfig,
     device: str = "cpu",
+    light: Light | None = None,
 ) -> Method:
     """The method that `config.method` names, in its initial state; arguments as in `Method.create`."""
     training: type[Method] = training_class(config.method)
-    return training.create(sequence, coords, views, config, device)
+    return training.create(sequence, coords, views, config, device, light)

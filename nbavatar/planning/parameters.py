@@ -19,6 +19,7 @@ __all__ = [
     "protocol_text",
     "stage_text",
     "start_digest",
+    "takes_light",
 ]
 
 
@@ -51,6 +52,15 @@ def comparison_text(plan: Plan) -> str:
 def method_of(plan: Plan, variant: str) -> str:
     """Name of the method that a variant trains."""
     return stage_options(plan.run, "train", variant)["method"]
+
+
+def takes_light(plan: Plan, variant: str) -> bool:
+    """Whether the training of a variant is given the light of the studio."""
+    if not plan.lit:
+        return False
+    train = stage_options(plan.run, "train", variant)
+    own = train.get(train["method"], {})
+    return bool(own.get("shading") and own.get("deferred"))
 
 
 def avatar_code(plan: Plan, verb: str, variant: str) -> str:

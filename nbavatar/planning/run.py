@@ -52,6 +52,11 @@ class Plan:
         return self.captured and self.run.stages.shell.reach > 0
 
     @property
+    def lit(self) -> bool:
+        """Whether the light of a capture's studio is estimated from the training cameras."""
+        return self.captured and self.run.stages.light.lights > 0
+
+    @property
     def solves_contact(self) -> bool:
         """Whether contact is a stage of the run: a capture's meshes may have it already."""
         return not (self.captured and self.run.stages.tracks.contact == "given")

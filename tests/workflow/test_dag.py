@@ -192,8 +192,8 @@ def test_a_comparison_has_avatars_of_its_own(project, tmp_path):
     compare = _named(project, "config/compare.yaml")["compare"]
     trained = 2 * 2 * len(compare["variants"])
     assert jobs["train"] == trained and jobs["evaluate"] == trained * len(compare.get("protocols", ("nv", "sr")))
-    # One shell serves all variants. No report, tables or videos.
-    assert jobs["compare"] == 1 and jobs["shell"] == 1
+    # One shell and one light serve all variants. No report, tables or videos.
+    assert jobs["compare"] == 1 and jobs["shell"] == 1 and jobs["light"] == 1
     assert not {"table", "figure", "report", "video", "speed"} & jobs.keys()
 
 

@@ -289,9 +289,9 @@ def _added(name):
 
 MASKED = {**CHECKED, "masks": 1, "crop": 1}
 # Meshes are drawn to the outlines of the training cameras' masks, and what the head lacks is carved from them.
-CARVED = {**MASKED, "align": 1, "shell": 1, "spectral": 1}
+CARVED = {**MASKED, "align": 1, "shell": 1, "light": 1, "spectral": 1}
 SEEN = {**CHECKED, "ingest": 1, "masks": 1, "crop": 1}
-MOVED = {**CHECKED, **dict.fromkeys(("tracks", "masks", "crop", "align", "shell", "spectral"), ALL), **TRAINED}
+MOVED = {**CHECKED, **dict.fromkeys(("tracks", "masks", "crop", "align", "shell", "light", "spectral"), ALL), **TRAINED}
 EDITS = {
     "nothing but a copy": (lambda root: None, {}),
     "a mask": (_edited("masks/c0/f1.png"), CARVED | TRAINED),
@@ -299,11 +299,11 @@ EDITS = {
     "a mask replaced": (_replaced("masks/c2/f3.png"), CARVED | TRAINED),
     "a mask removed": (lambda root: (root / "masks/c0/f2.png").unlink(), CARVED | TRAINED),
     "coverage added": (_added("alpha/c0/f0.png"), CARVED | TRAINED),
-    "an image": (_edited("images/c0/f1.png"), SEEN | {"align": 1, "shell": 1, "spectral": 1} | TRAINED),
+    "an image": (_edited("images/c0/f1.png"), SEEN | {"align": 1, "shell": 1, "light": 1, "spectral": 1} | TRAINED),
     "an image of the held-out camera": (_edited("images/c1/f0.png"), SEEN | HELD_OUT),
     "an image renamed": (
         lambda root: (root / "images/c2/f0.png").rename(root / "images/c2/f0.PNG"),
-        SEEN | {"align": 1, "shell": 1, "spectral": 1} | TRAINED,
+        SEEN | {"align": 1, "shell": 1, "light": 1, "spectral": 1} | TRAINED,
     ),
     "a mesh": (_edited("meshes/f2.npz"), MOVED),
     "a mesh replaced": (_replaced("meshes/f0.npz"), MOVED),

@@ -62,6 +62,16 @@ def start_of(wildcards):
     return [start] if start else []
 
 
+def light_of(wildcards):
+    """The studio's light, where the method of a variant can use it."""
+    lit = parameters.takes_light(PLAN, wildcards.variant)
+    return (
+        files(rules.light.output.lights, [units.Person(wildcards.subject)])
+        if lit
+        else []
+    )
+
+
 def judged_frames(subject, protocol):
     """Crops that a protocol looks at."""
     try:

@@ -1,8 +1,8 @@
-"""Refit or alignment, what the meshes lack, spectral coordinates, contact deformation.
+"""Refit or alignment, what the meshes lack, the studio's light, spectral coordinates, contact deformation.
 
 REQUIRED INPUTS: results/{run}/tracks/{subject}.npz, results/{run}/ingest/{subject}/*.zip
 OUTPUTS: results/{run}/fit/{subject}.{npz,png} or results/{run}/align/{subject}.npz,
-         results/{run}/shell/{subject}.{npz,png},
+         results/{run}/shell/{subject}.{npz,png}, results/{run}/light/{subject}.{npz,png},
          results/{run}/spectral/{subject}.npz, results/{run}/deform/{subject}.{npz,exr.zip}
 """
 
@@ -105,6 +105,41 @@ if PLAN.shelled:
         shell:
             "nbavatar shell --meshes {input.meshes:q} --masks {input.masks:q} --out {output.meshes:q}"
             " --picture {output.picture:q} --cfg {params.cfg:q} > {log:q} 2>&1"
+
+
+if PLAN.lit:
+
+    rule light:
+        input:
+            meshes=lambda w: mesh_file(units.whole(PLAN, w.subject)),
+            frames=lambda w: files(
+                rules.ingest.output, units.training_views(PLAN, w.subject)
+            ),
+            masks=lambda w: files(
+                rules.masks.output, units.training_views(PLAN, w.subject)
+            ),
+        output:
+            lights="results/{run}/light/{subject}.npz",
+            picture=report(
+                "results/{run}/light/{subject}.png",
+                category="Geometry",
+                labels={"stage": "light", "subject": "{subject}"},
+                caption="../report/light.rst",
+            ),
+        log:
+            "logs/{run}/light/{subject}.log",
+        benchmark:
+            "benchmarks/{run}/light/{subject}.jsonl"
+        priority: 10
+        resources:
+            mem="4GB",
+            runtime="1h",
+        params:
+            cfg=options("light"),
+            code=code_digest("light"),
+        shell:
+            "nbavatar light --meshes {input.meshes:q} --frames {input.frames:q} --masks {input.masks:q}"
+            " --out {output.lights:q} --picture {output.picture:q} --cfg {params.cfg:q} > {log:q} 2>&1"
 
 
 rule spectral:

@@ -92,6 +92,11 @@ rule report:
                 if PLAN.shelled
                 else []
             ),
+            *(
+                files(rules.light.output.picture, units.people(PLAN))
+                if PLAN.lit
+                else []
+            ),
             *files(rules.spectral.output.picture, units.people(PLAN)),
             *(
                 files(rules.deform.output.picture, units.people(PLAN))

@@ -25,6 +25,8 @@ else:
     STAGES["fit"] = files(rules.fit.output.meshes, units.people(PLAN))
 if PLAN.shelled:
     STAGES["shell"] = files(rules.shell.output.meshes, units.people(PLAN))
+if PLAN.lit:
+    STAGES["light"] = files(rules.light.output.lights, units.people(PLAN))
 if PLAN.aligned:
     STAGES["align"] = files(rules.align.output, units.people(PLAN))
 

@@ -20,11 +20,12 @@ from nbavatar.math.rotations import matrix_to_quaternion
 from nbavatar.mesh.frames import FaceFrames, face_frames
 from nbavatar.methods.base import MeshAvatar, Stages, compose
 from nbavatar.methods.billboards.architecture import Architecture, check_stored
-from nbavatar.methods.billboards.billboards import Billboards, Posed, with_normals
+from nbavatar.methods.billboards.billboards import Billboards, Posed, with_light
 from nbavatar.methods.billboards.compression.sized import SizedBillboards
 from nbavatar.methods.billboards.engine import DecoderEngine
 from nbavatar.methods.billboards.refine import Refinement
 from nbavatar.methods.billboards.region import Region, full_region, paste, region_of, shift_camera
+from nbavatar.methods.billboards.shading import Shading
 from nbavatar.methods.billboards.unet import macs
 from nbavatar.rendering.billboards.functional import render_billboards
 
@@ -40,12 +41,14 @@ class Anchor(NamedTuple):
         frames: face frames of the parts that are there.
         quats: rotations of the frames, wxyz (F, 4).
         keep: indices of the faces whose part is there in this frame, or None for all.
+        light: what the decoder is told of the light on these faces: normals, then shading, if any (F, L).
         penalty: of the refinement, scalar [m^2].
     """
 
     frames: FaceFrames
     quats: Tensor
     keep: Tensor | None
+    light: Tensor
     penalty: Tensor
 
 
@@ -56,7 +59,7 @@ class Window(NamedTuple):
         colour: I_R (without deferred rendering: colour divided by opacity), (3, h, w).
         alpha: I_alpha, (h, w).
         nb_alpha: opacity of the rasterized billboards I_alpha^NB, (h, w).
-        features: premultiplied features I_f^NB (C, h, w); where the decoder sees normals, those too (C + 3, h, w).
+        features: premultiplied features I_f^NB (C, h, w); behind them what is told of the light (C + L, h, w).
         region: where the window lies.
     """
 
@@ -74,6 +77,7 @@ class Avatar(MeshAvatar):
         billboards: one per face (`SizedBillboards` where textures have sizes of their own).
         unet: renderer R, or None without deferred rendering.
         refinement: compensation of fitting errors on training frames, or None.
+        shading: the studio's light on the faces, or None where the decoder is not told.
         engine: what decodes in torch's place where it can, or None (`use_engine`).
     """
 
@@ -87,6 +91,7 @@ class Avatar(MeshAvatar):
         billboards: Billboards,
         *,
         refinement: Refinement | None = None,
+        shading: Shading | None = None,
         record: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(faces, vertex_counts, record)
@@ -95,6 +100,7 @@ class Avatar(MeshAvatar):
         unet = architecture.renderer() if architecture.deferred else None
         self.unet = None if unet is None else unet.to(memory_format=torch.channels_last)
         self.refinement = refinement
+        self.shading = shading
         self.engine: DecoderEngine | None = None
 
     @property
@@ -133,12 +139,28 @@ class Avatar(MeshAvatar):
             return points
 
         points, keep = self.merged(verts, refined)
-        frames = face_frames(points, self.faces if keep is None else self.faces[keep])
-        return Anchor(frames, matrix_to_quaternion(frames.R), keep, penalty)
+        faces = self.faces if keep is None else self.faces[keep]
+        frames = face_frames(points, faces)
+        return Anchor(frames, matrix_to_quaternion(frames.R), keep, self._light(points, faces, frames, verts), penalty)
+
+    def _light(self, points: Tensor, faces: Tensor, frames: FaceFrames, verts: Mapping[str, Tensor]) -> Tensor:
+        """What the decoder is told of the light on these faces, (F, L)."""
+        # A mesh that is refined moves to where it is seen, not to be lit.
+        normals = frames.R[..., 2].detach()
+        told = [normals] if self.architecture.normals else [normals[:, :0]]
+        if self.shading is not None:
+            first, start = {}, 0
+            for part, count in self.vertex_counts.items():
+                if part in verts and bool(torch.isfinite(verts[part]).all()):
+                    first[part] = start
+                start += count
+            told.append(self.shading(points, faces, normals, first))
+        return torch.cat(told, dim=1)
 
     def place(self, anchor: Anchor) -> tuple[Posed, Tensor | None]:
         """Billboards in world space, and the indices of those that are there (None: all)."""
-        return self.billboards.pose(anchor.frames, anchor.quats, anchor.keep), anchor.keep
+        posed = self.billboards.pose(anchor.frames, anchor.quats, anchor.keep)
+        return posed._replace(light=anchor.light), anchor.keep
 
     def pose(self, verts: Mapping[str, Tensor], frame: str | None = None) -> tuple[Posed, Tensor | None]:
         """Pose the billboards on one frame's meshes: `anchor` and `place`."""
@@ -196,8 +218,8 @@ class Avatar(MeshAvatar):
         return (features if self.unet is not None else torch.sigmoid(features)), self.billboards.alpha()
 
     def drawn(self, features: Tensor, posed: Posed) -> Tensor:
-        """What is rasterized for the decoder: features (F, T, T, C), with normals behind them where it sees those."""
-        return with_normals(features, posed.normals) if self.architecture.normals else features
+        """What is rasterized for the decoder: features (F, T, T, C), behind them what it is told of the light."""
+        return with_light(features, posed.light)
 
     def use_engine(self, kind: str) -> str:
         """See `MeshAvatar.use_engine`."""
@@ -349,6 +371,7 @@ class Avatar(MeshAvatar):
             content["vertex_counts"],
             billboards,
             refinement=_empty_refinement(content["refinement"], state),
+            shading=Shading.of_state(state, "shading.") if architecture.shading else None,
             record=record,
         )
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from nbavatar.math.rotations import matrix_to_quaternion, normalize_quaternion, quaternion_multiply
 from nbavatar.mesh.frames import FaceFrames
 
-__all__ = ["Billboards", "Posed", "gaussian_alpha_logits", "initial_half_extents", "with_normals"]
+__all__ = ["Billboards", "Posed", "gaussian_alpha_logits", "initial_half_extents", "with_light"]
 
 # Faces whose box would be thinner than this fraction of its longer side get this fraction: slivers stay visible.
 _THINNEST = 0.1
@@ -34,13 +34,13 @@ class Posed(NamedTuple):
         means: (F, 3) [m].
         quats: unit quaternions wxyz (F, 4).
         half_extents: (F, 2) [m].
-        normals: unit normals of their faces (F, 3), without gradients.
+        light: what the decoder is told of the light on their faces, without gradients (F, L); L may be 0.
     """
 
     means: Tensor
     quats: Tensor
     half_extents: Tensor
-    normals: Tensor
+    light: Tensor
 
     @property
     def planes(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -88,6 +88,9 @@ class Billboards(nn.Module):
             frames: T (F, 3) [m], R (F, 3, 3), k (F,) [m].
             anchors: quaternions of R (F, 4) if known already; saves their computation.
             keep: indices of the billboards that the frames belong to; None for all.
+
+        Returns:
+            where they are; nothing is known of their light here (L = 0).
         """
         mu, quat, log_scale = self.mu, self.quat, self.log_scale
         if keep is not None:
@@ -97,21 +100,22 @@ class Billboards(nn.Module):
         means = torch.einsum("fij,fj->fi", frames.R, mu) * scale + frames.T
         quats = quaternion_multiply(anchor, normalize_quaternion(quat))
         half_extents = scale * log_scale.clamp(*_LOG_SCALE_RANGE).exp()
-        # A mesh that is refined moves to where it is seen, not to be lit.
-        return Posed(means, quats, half_extents, frames.R[..., 2].detach())
+        return Posed(means, quats, half_extents, means.new_zeros(len(means), 0))
 
     def alpha(self) -> Tensor:
         """Opacity textures in [0, 1], (F, T, T)."""
         return torch.sigmoid(self.alpha_logit)
 
 
-def with_normals(features: Tensor, normals: Tensor) -> Tensor:
-    """Textures (F, T, T, C) with the normals (F, 3) as three more channels, equal in all texels of a billboard.
+def with_light(features: Tensor, light: Tensor) -> Tensor:
+    """Textures (F, T, T, C) with the light (F, L) as L more channels, equal in all texels of a billboard.
 
-    Not part of the paper. Where light stands still, how bright a surface is depends on its direction in the world, and
-    a texture that turns with the mesh cannot say so.
+    Not part of the paper. Where light stands still, how bright a surface is depends on its direction in the world and
+    on what shadows it, and a texture that rides with the mesh cannot say so.
     """
-    return torch.cat((features, normals[:, None, None].expand(*features.shape[:-1], 3)), dim=-1)
+    if light.shape[1] == 0:
+        return features
+    return torch.cat((features, light[:, None, None].expand(*features.shape[:-1], -1)), dim=-1)
 
 
 def initial_half_extents(verts: Tensor, faces: Tensor, frames: FaceFrames, *, margin: float) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from nbavatar.config.training import TrainConfig
+from nbavatar.data.lights import Light
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.errors import DataError
 from nbavatar.mesh.frames import face_frames
@@ -18,6 +19,7 @@ from nbavatar.methods.billboards.billboards import Billboards, gaussian_alpha_lo
 from nbavatar.methods.billboards.losses import knn_graph
 from nbavatar.methods.billboards.options import BillboardsConfig
 from nbavatar.methods.billboards.refine import Refinement, displacement_basis
+from nbavatar.methods.billboards.shading import Shading
 
 __all__ = ["initial_avatar", "neighbour_graph"]
 
@@ -26,7 +28,11 @@ _RANDOM_SPREAD = 0.5
 
 
 def initial_avatar(
-    sequence: MeshSequence, coords: Mapping[str, np.ndarray], frames: Sequence[str], config: TrainConfig
+    sequence: MeshSequence,
+    coords: Mapping[str, np.ndarray],
+    frames: Sequence[str],
+    config: TrainConfig,
+    light: Light | None = None,
 ) -> Avatar:
     """Build an avatar in its initial state; the same seed gives the same bits.
 
@@ -35,6 +41,7 @@ def initial_avatar(
         coords: spectral coordinates per part, float (V, K); may be empty for random features without refinement.
         frames: training frames, for the refinement.
         config: training options.
+        light: of the studio; None, or one without lights, where it is not known.
 
     Raises:
         DataError: spectral coordinates of a part are missing or of another vertex count.
@@ -62,6 +69,7 @@ def initial_avatar(
     if options.refine.modes > 0:
         basis = {part: torch.from_numpy(np.asarray(coords[part])) for part in parts}
         refinement = Refinement(frames, displacement_basis(basis, options.refine.modes), rigid=options.refine.rigid)
+    shaded = options.deferred and options.shading and light is not None and len(light.weights) > 0
     return Avatar(
         Architecture(
             channels=_channels(options),
@@ -73,6 +81,7 @@ def initial_avatar(
             unet_convs=options.unet.convs,
             unet_form=options.unet.form,
             normals=options.deferred and options.normals,
+            shading=shaded,
             roi=options.roi,
             roi_margin=options.roi_margin,
             order=options.order,
@@ -81,6 +90,7 @@ def initial_avatar(
         {part: len(sequence.parts[part].rest) for part in parts},
         billboards,
         refinement=refinement,
+        shading=Shading(light) if shaded and light is not None else None,
     )
 
 

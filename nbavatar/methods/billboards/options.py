@@ -62,6 +62,11 @@ class BillboardsConfig:
         "The U-Net also sees the normal of each billboard's face in the world: it learns how a light that stands "
         "still shades what turns; not part of the paper.",
     )
+    shading: bool = option(
+        True,
+        "The U-Net also sees how much of the studio's light reaches each face, shadows included, where a training is "
+        "given that light (`nbavatar light`); not part of the paper, whose trainings are given none.",
+    )
     init: str = option("spectral", "Initial features.", choices=("spectral", "random"))
     unet: UNetConfig = option(UNetConfig, "The deferred renderer.")
     extent_margin: float = option(1.5, "Half extents at the start, in boxes around the triangle.", min=0.1)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nbavatar.config.training import TrainConfig
+from nbavatar.data.lights import Light
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
 from nbavatar.errors import ConfigError
@@ -58,6 +59,7 @@ class BillboardTraining(Method):
         views: Sequence[View],
         config: TrainConfig,
         device: str,
+        light: Light | None = None,
     ) -> "BillboardTraining":
         """See `Method.create`."""
         options: BillboardsConfig = config.own
@@ -65,7 +67,7 @@ class BillboardTraining(Method):
             weights = "--cfg.billboards: weight_mse, weight_l1, weight_dssim"
             raise ConfigError.of(weights, expected="one above 0, or no colour is learnt", found="three zeros")
         frames = [sequence.frames[row] for row in sorted({view.row for view in views})]
-        avatar = initial_avatar(sequence, coords, frames, config).to(device)
+        avatar = initial_avatar(sequence, coords, frames, config, light).to(device)
         neighbours = neighbour_graph(avatar, sequence, config)
         offsets = SmoothOffsets(avatar, sequence, coords) if options.rates.offset > 0 else None
         return cls(avatar, None if neighbours is None else neighbours.to(device), config, offsets)

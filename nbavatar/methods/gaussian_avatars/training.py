@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from nbavatar.config.training import TrainConfig
+from nbavatar.data.lights import Light
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import View
 from nbavatar.methods.gaussian_avatars.avatar import GaussianAvatars
@@ -25,6 +26,7 @@ class GaussianAvatarsTraining(BoundTraining):
         views: Sequence[View],
         config: TrainConfig,
         device: str,
+        light: Light | None = None,
     ) -> "GaussianAvatarsTraining":
         """See `Method.create`; spectral coordinates are not used."""
         arguments, _ = first_gaussians(sequence, config)

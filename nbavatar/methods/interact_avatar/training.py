@@ -13,6 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from nbavatar.config.training import TrainConfig
+from nbavatar.data.lights import Light
 from nbavatar.data.sequences import PARTS, MeshSequence
 from nbavatar.data.views import View
 from nbavatar.methods.base import MeshAvatar, Taken
@@ -40,6 +41,7 @@ class InteractAvatarTraining(BoundTraining):
         views: Sequence[View],
         config: TrainConfig,
         device: str,
+        light: Light | None = None,
     ) -> "InteractAvatarTraining":
         """See `Method.create`; spectral coordinates are not used, poses are learnt from the frames of the views."""
         options: InteractAvatarConfig = config.own

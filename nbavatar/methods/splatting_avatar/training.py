@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from nbavatar.config.training import TrainConfig
+from nbavatar.data.lights import Light
 from nbavatar.data.sequences import MeshSequence
 from nbavatar.data.views import Sample, View
 from nbavatar.methods.base import StepLoss, modelled_parts
@@ -49,6 +50,7 @@ class SplattingAvatarTraining(GaussianTraining):
         views: Sequence[View],
         config: TrainConfig,
         device: str,
+        light: Light | None = None,
     ) -> "SplattingAvatarTraining":
         """See `Method.create`; spectral coordinates are not used."""
         options, parts = config.own, modelled_parts(sequence, config)

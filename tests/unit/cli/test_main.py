@@ -111,7 +111,20 @@ def test_an_input_is_not_replaced_by_a_result(tmp_path, capsys, link):
 # Options that name a file to read; every other option that names a file has to be one that writes it.
 READ = {
     *("assets", "camera", "cameras", "capture", "cfg", "evals", "extremes", "figures", "flame", "frames", "histories"),
-    *("layout", "masks", "meshes", "model", "models", "photos", "pictures", "presets", "protocol", "render", "renders"),
+    *(
+        "layout",
+        "light",
+        "masks",
+        "meshes",
+        "model",
+        "models",
+        "photos",
+        "pictures",
+        "presets",
+        "protocol",
+        "render",
+        "renders",
+    ),
     *(
         "reported",
         "sequences",

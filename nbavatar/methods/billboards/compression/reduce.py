@@ -94,7 +94,12 @@ def _rebuilt(
     # Built without a renderer, so that no second U-Net is made only to be dropped.
     plain = dataclasses.replace(architecture, deferred=False)
     counts = {part: avatar.vertex_counts[part] for part in faces}
-    result = Avatar(plain, faces, counts, billboards, refinement=avatar.refinement, record=avatar.record)
+    shading = avatar.shading
+    if shading is not None and len(billboards.mu) < len(avatar.faces):
+        shading = shading.without(list(faces), avatar.part_faces())
+    result = Avatar(
+        plain, faces, counts, billboards, refinement=avatar.refinement, shading=shading, record=avatar.record
+    )
     result.architecture, result.unet, result.engine = architecture, avatar.unet, avatar.engine
     return result.to(avatar.faces.device).eval()
 

@@ -243,6 +243,7 @@ def test_files_from_before_there_were_forms_hold_the_papers(tmp_path) -> None:
     content = torch.load(tmp_path / "model.pt", weights_only=True)
     assert content["architecture"].pop("unet_form") == "paper"
     assert content["architecture"].pop("normals") is False
+    assert content["architecture"].pop("shading") is False
     torch.save(content, tmp_path / "model.pt")
     for a, b in zip(render(avatar), render(load_avatar(tmp_path / "model.pt")), strict=True):
         assert torch.equal(a, b)
