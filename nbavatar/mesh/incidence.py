@@ -52,15 +52,18 @@ def _draw(seen, faces, depth):
         x1 = min(int(np.floor(max(ax, bx, cx) - 0.5)), side - 1)
         y0 = max(int(np.ceil(min(ay, by, cy) - 0.5)), 0)
         y1 = min(int(np.floor(max(ay, by, cy) - 0.5)), side - 1)
-        first, second, third = seen[a, 2], seen[b, 2], seen[c, 2]
+        # Edge functions of b and c, up to the area, and the slopes of the height.
+        ux, uy, vx, vy = cy - ay, ax - cx, ay - by, bx - ax
+        up, over = (seen[b, 2] - seen[a, 2]) / area, (seen[c, 2] - seen[a, 2]) / area
+        slope_x, slope_y = up * ux + over * vx, up * uy + over * vy
         for y in range(y0, y1 + 1):
+            py = y + 0.5 - ay
             for x in range(x0, x1 + 1):
-                px, py = x + 0.5 - ax, y + 0.5 - ay
-                u = (px * (cy - ay) - py * (cx - ax)) / area
-                v = ((bx - ax) * py - (by - ay) * px) / area
-                if u < 0.0 or v < 0.0 or u + v > 1.0:
+                px = x + 0.5 - ax
+                u, v = px * ux + py * uy, px * vx + py * vy
+                if u < 0.0 or v < 0.0 or u + v > area:
                     continue
-                height = first + u * (second - first) + v * (third - first)
+                height = seen[a, 2] + px * slope_x + py * slope_y
                 if height > depth[y, x]:
                     depth[y, x] = height
 

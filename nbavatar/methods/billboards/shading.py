@@ -8,6 +8,8 @@ scale of the pictures, and between -1 and little more than 1.
 Faces that were pruned away (`nbavatar.methods.billboards.compression`) still throw shadows.
 """
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -20,6 +22,7 @@ __all__ = ["Shading"]
 
 _GAMMA = 2.2
 _OCCLUDERS = "occluders_"
+_KEPT_BYTES = 64_000_000  # of poses whose light is remembered: cameras that look at one pose ask again
 
 
 class Shading(nn.Module):
@@ -40,6 +43,7 @@ class Shading(nn.Module):
         self.register_buffer("weights", torch.from_numpy(np.array(light.weights, np.float32)))
         for part, faces in (occluders or {}).items():
             self.register_buffer(_OCCLUDERS + part, faces.to(torch.int32))
+        self._kept: OrderedDict[bytes, np.ndarray] = OrderedDict()
 
     @classmethod
     def of_state(cls, state: Mapping[str, Tensor], prefix: str) -> "Shading":
@@ -73,14 +77,30 @@ class Shading(nn.Module):
             faces: that are lit, in numbers of that array (G, 3); normals: theirs, unit (G, 3).
             first: parts that are in the frame, and where the vertices of each begin.
         """
+        arrays = [value.detach().cpu().numpy() for value in (points, faces, normals, self.directions, self.weights)]
+        digest = hashlib.blake2b(repr(list(first)).encode())
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array))
+        key = digest.digest()
+        told = self._kept.pop(key, None)
+        if told is None:
+            told = self._told(*arrays, first)
+        self._kept[key] = told
+        while len(self._kept) > max(1, _KEPT_BYTES // max(1, told.nbytes)):
+            self._kept.popitem(last=False)
+        return torch.from_numpy(told)[:, None].to(points)
+
+    def _told(
+        self, points: np.ndarray, faces: np.ndarray, normals: np.ndarray, directions: np.ndarray, weights: np.ndarray,
+        first: Mapping[str, int],
+    ) -> np.ndarray:  # fmt: skip
+        """The same as `forward`, computed; float32 (G,)."""
         from nbavatar.mesh.incidence import incidence  # with Numba, which avatars without shading do not need
 
-        stored = self.occluders
-        hiding = torch.cat([stored[part] + start for part, start in first.items()]) if stored and first else faces
-        reached = incidence(
-            points.detach().cpu().numpy(), faces.cpu().numpy(), normals.detach().cpu().numpy(),
-            self.directions.cpu().numpy(), occluders=hiding.cpu().numpy(),
-        )  # fmt: skip
+        stored, hiding = self.occluders, faces
+        if stored and first:
+            hiding = np.concatenate([stored[part].cpu().numpy() + start for part, start in first.items()])
+        reached = incidence(points, faces, normals, directions, occluders=hiding)
         # In one order, whatever the number of threads.
-        shine = (self.weights.cpu().double().numpy()[:, None] * reached).sum(0)
-        return torch.from_numpy(2.0 * shine ** (1.0 / _GAMMA) - 1.0)[:, None].to(points)
+        shine = (weights.astype(np.float64)[:, None] * reached).sum(0)
+        return (2.0 * shine ** (1.0 / _GAMMA) - 1.0).astype(np.float32)

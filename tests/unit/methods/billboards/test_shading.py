@@ -64,6 +64,16 @@ def test_a_hand_throws_its_shadow_only_where_it_is() -> None:
     assert (both[head, -1] < posed.light[:, -1] + 0.05).all() and (both[head, -1] < posed.light[:, -1] - 0.1).any()
 
 
+def test_what_is_remembered_is_what_would_be_computed() -> None:
+    avatar = lit_avatar()
+    once = _told(avatar, CLOSE)
+    elsewhere = _told(avatar, VERTS)
+    assert not torch.equal(once, elsewhere)
+    assert torch.equal(once, _told(avatar, CLOSE)) and torch.equal(once, _told(lit_avatar(), CLOSE))
+    avatar.shading.weights.copy_(avatar.shading.weights.flip(0))
+    assert not torch.equal(once, _told(avatar, CLOSE))
+
+
 def test_what_is_pruned_still_throws_shadows(tmp_path) -> None:
     avatar = lit_avatar()
     whole = _told(avatar, CLOSE)
