@@ -42,7 +42,7 @@ from nbavatar.provenance import run_record
 
 __all__ = ["add_arguments", "main"]
 
-_COVERED = 255  # coverage of pixels that show one surface alone
+_COVERED = 250  # coverage from which a pixel shows one surface alone [1/255]
 _SHOWN = 4  # photographs in the picture
 
 

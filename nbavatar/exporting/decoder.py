@@ -5,7 +5,8 @@
                                                 metadata says `normals`, three channels more: the faces' unit normals,
                                                 world, premultiplied too, between features and alpha; where it says
                                                 `shading`, one more behind them: 2 E^(1/2.2) - 1 of the light E on the
-                                                faces, premultiplied
+                                                faces; where it says `gloss`, three more: the direction, unit, world,
+                                                that each face mirrors the line of sight to; premultiplied
     outputs  colour    float32 (1, 3, H, W)     I_R in [0, 1], sRGB
              opacity   float32 (1, 1, H, W)     I_alpha in [0, 1]
 
@@ -66,7 +67,14 @@ def decoder_model(avatar: MeshAvatar, record: dict[str, Any]) -> bytes:
     assert program is not None
     model = program.model_proto
     a = avatar.architecture
-    known = {"multiple": multiple, "channels": a.channels, "normals": a.normals, "shading": a.shading, "export": record}
+    known = {
+        "multiple": multiple,
+        "channels": a.channels,
+        "normals": a.normals,
+        "shading": a.shading,
+        "gloss": a.gloss,
+        "export": record,
+    }
     onnx.helper.set_model_props(model, {name: json.dumps(value, sort_keys=True) for name, value in known.items()})
     stream = io.BytesIO()
     onnx.save_model(model, stream)

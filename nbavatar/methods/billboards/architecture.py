@@ -31,11 +31,12 @@ class Architecture:
     unet_form: str = "paper"  # what files hold that were written before there was another
     normals: bool = False  # in files of before, too
     shading: bool = False  # as well
+    gloss: bool = False  # as well; only with normals
 
     @property
     def decoded_channels(self) -> int:
-        """Channels that the U-Net takes: features, normals and light where it sees them, alpha."""
-        return self.channels + 3 * self.normals + self.shading + 1
+        """Channels that the U-Net takes: features; normals, light and gloss where it sees them; alpha."""
+        return self.channels + 3 * self.normals + self.shading + 3 * self.gloss + 1
 
     def renderer(self) -> UNet:
         """The U-Net of these numbers, its weights still random."""
@@ -61,6 +62,8 @@ def check_stored(a: Architecture, refinement: Mapping[str, Any] | None, state: M
         for name, value in unet.state_dict().items():
             if state[f"unet.{name}"].shape != value.shape:
                 raise ValueError(f"unet.{name} of {list(state[f'unet.{name}'].shape)} instead of {list(value.shape)}")
+    if a.gloss and not a.normals:
+        raise ValueError("gloss without normals")
     if a.shading:
         found = list(state["shading.directions"].shape), list(state["shading.weights"].shape)
         if found[0][1:] != [3] or found[1] != found[0][:1]:

@@ -20,7 +20,7 @@ from nbavatar.math.rotations import matrix_to_quaternion
 from nbavatar.mesh.frames import FaceFrames, face_frames
 from nbavatar.methods.base import MeshAvatar, Stages, compose
 from nbavatar.methods.billboards.architecture import Architecture, check_stored
-from nbavatar.methods.billboards.billboards import Billboards, Posed, with_light
+from nbavatar.methods.billboards.billboards import Billboards, Posed, mirrored_sight, with_light
 from nbavatar.methods.billboards.compression.sized import SizedBillboards
 from nbavatar.methods.billboards.engine import DecoderEngine
 from nbavatar.methods.billboards.refine import Refinement
@@ -193,7 +193,7 @@ class Avatar(MeshAvatar):
         features, alpha = self.textures()
         if keep is not None:
             features, alpha = features[keep], alpha[keep]
-        features = self.drawn(features, posed)
+        features = self.drawn(features, posed, viewmat)
         region = full_region(width, height, self.multiple)
         if a.roi if roi is None else roi:
             region = region_of(posed, viewmat, K, width, height, multiple=self.multiple, margin=a.roi_margin)
@@ -209,6 +209,10 @@ class Avatar(MeshAvatar):
             region.height,
             order=order or a.order,
         )
+        if a.gloss:
+            # Whatever the loss would like gloss to be, billboards neither move nor fade for it: trainings that let them
+            # lose detail everywhere (docs/decisions/015-gloss.md).
+            premultiplied = torch.cat((premultiplied[:-3], premultiplied[-3:].detach()))
         colour, opacity = self.decode(premultiplied, nb_alpha, precision, engine=engine)
         return Window(colour, opacity, nb_alpha, premultiplied, region)
 
@@ -217,9 +221,12 @@ class Avatar(MeshAvatar):
         features = self.billboards.features
         return (features if self.unet is not None else torch.sigmoid(features)), self.billboards.alpha()
 
-    def drawn(self, features: Tensor, posed: Posed) -> Tensor:
-        """What is rasterized for the decoder: features (F, T, T, C), behind them what it is told of the light."""
-        return with_light(features, posed.light)
+    def drawn(self, features: Tensor, posed: Posed, viewmat: Tensor) -> Tensor:
+        """What is rasterized for the decoder: features (F, T, T, C), behind them what it is told of light and gloss."""
+        told = posed.light
+        if self.architecture.gloss:
+            told = torch.cat((told, mirrored_sight(told[:, :3], posed.means.detach(), viewmat)), dim=1)
+        return with_light(features, told)
 
     def use_engine(self, kind: str) -> str:
         """See `MeshAvatar.use_engine`."""
@@ -306,7 +313,7 @@ class Avatar(MeshAvatar):
             if keep is not None:
                 features, alpha = features[keep], alpha[keep]
             window = self.window(posed, keep, viewmat, K, width, height)
-            drawn = self.drawn(features, posed)
+            drawn = self.drawn(features, posed, viewmat)
             rgb = features[..., [min(i, features.shape[-1] - 1) for i in range(3)]].contiguous()
         region = window.region
 

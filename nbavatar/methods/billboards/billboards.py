@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from nbavatar.math.rotations import matrix_to_quaternion, normalize_quaternion, quaternion_multiply
 from nbavatar.mesh.frames import FaceFrames
 
-__all__ = ["Billboards", "Posed", "gaussian_alpha_logits", "initial_half_extents", "with_light"]
+__all__ = ["Billboards", "Posed", "gaussian_alpha_logits", "initial_half_extents", "mirrored_sight", "with_light"]
 
 # Faces whose box would be thinner than this fraction of its longer side get this fraction: slivers stay visible.
 _THINNEST = 0.1
@@ -116,6 +116,20 @@ def with_light(features: Tensor, light: Tensor) -> Tensor:
     if light.shape[1] == 0:
         return features
     return torch.cat((features, light[:, None, None].expand(*features.shape[:-1], -1)), dim=-1)
+
+
+def mirrored_sight(normals: Tensor, points: Tensor, viewmat: Tensor) -> Tensor:
+    """Direction in which a mirror on each face would show the camera what it sees, unit, world (F, 3).
+
+    Not part of the paper. Gloss is light from about that direction, so it wanders over hair and skin as the camera
+    moves; a texture stays where it is.
+
+    Args:
+        normals: unit, world (F, 3); points: on the faces (F, 3) [m]; viewmat: world to camera (4, 4).
+    """
+    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    towards = torch.nn.functional.normalize(eye - points, dim=1)
+    return 2.0 * (normals * towards).sum(1, keepdim=True) * normals - towards
 
 
 def initial_half_extents(verts: Tensor, faces: Tensor, frames: FaceFrames, *, margin: float) -> Tensor:

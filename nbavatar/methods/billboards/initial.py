@@ -82,6 +82,7 @@ def initial_avatar(
             unet_form=options.unet.form,
             normals=options.deferred and options.normals,
             shading=shaded,
+            gloss=options.deferred and options.gloss,
             roi=options.roi,
             roi_margin=options.roi_margin,
             order=options.order,

@@ -62,6 +62,11 @@ class BillboardsConfig:
         "The U-Net also sees the normal of each billboard's face in the world: it learns how a light that stands "
         "still shades what turns; not part of the paper.",
     )
+    gloss: bool = option(
+        False,
+        "The U-Net also sees where each face would mirror the camera's line of sight to, and learns gloss, which "
+        "wanders as the camera moves; only with `normals`; not part of the paper.",
+    )
     shading: bool = option(
         True,
         "The U-Net also sees how much of the studio's light reaches each face, shadows included, where a training is "

@@ -12,7 +12,17 @@ from nbavatar.methods.billboards.avatar import Avatar
 
 __all__ = ["take_over"]
 
-_UNET = ("channels", "normals", "shading", "unet_width", "unet_depth", "unet_max_width", "unet_convs", "unet_form")
+_UNET = (
+    "channels",
+    "normals",
+    "shading",
+    "gloss",
+    "unet_width",
+    "unet_depth",
+    "unet_max_width",
+    "unet_convs",
+    "unet_form",
+)
 _PLACES = ("mu", "quat", "log_scale")
 
 

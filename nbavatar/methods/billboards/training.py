@@ -66,6 +66,8 @@ class BillboardTraining(Method):
         if max(options.weight_mse, options.weight_l1, options.weight_dssim) == 0:
             weights = "--cfg.billboards: weight_mse, weight_l1, weight_dssim"
             raise ConfigError.of(weights, expected="one above 0, or no colour is learnt", found="three zeros")
+        if options.gloss and not options.normals:
+            raise ConfigError.of("--cfg.billboards.gloss", expected="false without `normals`", found="true")
         frames = [sequence.frames[row] for row in sorted({view.row for view in views})]
         avatar = initial_avatar(sequence, coords, frames, config, light).to(device)
         neighbours = neighbour_graph(avatar, sequence, config)

@@ -146,7 +146,8 @@ def _parts(scene: StepScene, crop: int) -> dict[str, Callable[[], None]]:
     view, K = sample.view.viewmat.to(device), sample.K.to(device)
     posed, _ = avatar.pose(verts, FRAME)
     textures, cover = avatar.textures()
-    fixed = [value.detach().requires_grad_(True) for value in (*posed.planes, avatar.drawn(textures, posed), cover)]
+    drawn = avatar.drawn(textures, posed, view)
+    fixed = [value.detach().requires_grad_(True) for value in (*posed.planes, drawn, cover)]
     region = full_region(side, side, avatar.multiple)
     stored = (sample.pixels.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
 

@@ -13,8 +13,10 @@ import trimesh
 from torch.nn import functional
 
 from nbavatar.cli import main
+from nbavatar.data.lights import Light
 from nbavatar.data.sequences import MeshSequence, read_sequence, write_sequence
 from nbavatar.methods.billboards.avatar import Avatar
+from nbavatar.methods.billboards.shading import Shading
 from nbavatar.methods.storage import load_avatar, save_avatar
 from nbavatar.rendering.gaussians.functional import render_gaussians
 from tests.scenes.toy import sequence
@@ -222,25 +224,28 @@ def test_tensors_build_the_avatar_again_by_the_schema(tmp_path, meshes) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("form", "normals"), [("paper", False), ("lean", False), ("lean", True)])
-def test_decoder_gives_the_same_picture_in_onnxruntime(tmp_path, form: str, normals: bool) -> None:
+@pytest.mark.parametrize(("form", "told"), [("paper", False), ("lean", False), ("lean", True)])
+def test_decoder_gives_the_same_picture_in_onnxruntime(tmp_path, form: str, told: bool) -> None:
     import onnxruntime
 
     avatar = make_avatar()
-    shape = dataclasses.replace(avatar.architecture, unet_form=form, normals=normals)
-    avatar = Avatar(shape, avatar.part_faces(), avatar.vertex_counts, avatar.billboards).eval()
+    shape = dataclasses.replace(avatar.architecture, unet_form=form, normals=told, shading=told, gloss=told)
+    light = Light(np.eye(3, dtype=np.float32), np.ones(3, np.float32))
+    shading = Shading(light) if told else None
+    avatar = Avatar(shape, avatar.part_faces(), avatar.vertex_counts, avatar.billboards, shading=shading).eval()
     save_avatar(tmp_path / "model.pt", avatar)
     assert export(tmp_path / "model.pt", "--to", "decoder", "--out", tmp_path / "d.onnx") == 0
     session = onnxruntime.InferenceSession(str(tmp_path / "d.onnx"), providers=["CPUExecutionProvider"])
     for height, width in ((16, 16), (40, 72)):
-        features = torch.randn(1, 8 if normals else 5, height, width)
+        features = torch.randn(1, 12 if told else 5, height, width)
         found = session.run(["colour", "opacity"], {"features": features.numpy()})
         with torch.no_grad():
             expected = avatar.unet(features)
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b.numpy(), atol=2e-6)  # float32 sums in another order
     stated = session.get_modelmeta().custom_metadata_map
-    assert [json.loads(stated[name]) for name in ("multiple", "channels", "normals")] == [8, 4, normals]
+    assert [json.loads(stated[name]) for name in ("multiple", "channels")] == [8, 4]
+    assert [json.loads(stated[name]) for name in ("normals", "shading", "gloss")] == [told] * 3
 
 
 @pytest.mark.parametrize(

@@ -121,3 +121,5 @@ def test_without_any_weight_of_colour_training_is_refused(scene) -> None:
     meshes, _ = read_sequence(scene["meshes"])
     with pytest.raises(ConfigError, match=r"weight_mse.*one above 0"):
         create_method(meshes, {}, [], train_config(weight_mse=0.0, init="random"))
+    with pytest.raises(ConfigError, match=r"billboards\.gloss: expected false without `normals`, found true"):
+        create_method(meshes, {}, [], train_config(gloss=True, init="random"))

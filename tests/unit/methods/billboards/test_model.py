@@ -26,14 +26,19 @@ VERTS = {
 
 
 def make_avatar(
-    *, deferred: bool = True, refinement: Refinement | None = None, roi: bool = True, normals: bool = False
+    *,
+    deferred: bool = True,
+    refinement: Refinement | None = None,
+    roi: bool = True,
+    normals: bool = False,
+    gloss: bool = False,
 ) -> Avatar:
     """An untrained avatar with random values everywhere."""
     torch.manual_seed(3)
     faces = {"head": torch.from_numpy(OCTAHEDRON_FACES), "right_hand": torch.from_numpy(TETRAHEDRON_FACES)}
     channels = 4 if deferred else 3
     billboards = Billboards(torch.full((12, 2), 0.7), torch.randn(12, 4, 4, channels), torch.randn(12, 4, 4))
-    architecture = Architecture(channels, 4, deferred, 4, 3, 16, 1, roi, 0.1, "ray", normals=normals)
+    architecture = Architecture(channels, 4, deferred, 4, 3, 16, 1, roi, 0.1, "ray", normals=normals, gloss=gloss)
     counts = {"head": 6, "right_hand": 4}
     return Avatar(architecture, faces, counts, billboards, refinement=refinement, record={"command": "test"}).eval()
 
@@ -237,6 +242,39 @@ def test_a_decoder_that_sees_normals_is_told_how_the_head_is_turned(tmp_path) ->
         assert torch.equal(a, b)
 
 
+def test_a_decoder_that_sees_gloss_is_told_where_faces_mirror_the_camera_to(tmp_path) -> None:
+    avatar = make_avatar(normals=True, gloss=True)
+    posed, _ = avatar.pose(VERTS)
+    drawn = avatar.drawn(avatar.textures()[0], posed, VIEW)
+    assert drawn.shape[-1] == 4 + 3 + 3
+    eye = torch.tensor([0.0, 0.0, -1.0])
+    for f in range(12):
+        # Householder: the mirror at the face's plane, of what travels from the camera to the billboard.
+        normal = drawn[f, 0, 0, 4:7].double()
+        sight = torch.nn.functional.normalize(posed.means[f].detach().double() - eye.double(), dim=0)
+        expected = (torch.eye(3).double() - 2 * torch.outer(normal, normal)) @ sight
+        torch.testing.assert_close(drawn[f, 2, 3, 7:].double(), expected, atol=1e-6, rtol=0)
+    # From elsewhere the same pose is told otherwise.
+    other = VIEW.clone()
+    other[0, 3] = 0.4
+    assert (avatar.drawn(avatar.textures()[0], posed, other)[..., 7:] - drawn[..., 7:]).abs().max() > 0.1
+    save_avatar(tmp_path / "model.pt", avatar)
+    for a, b in zip(render(avatar), render(load_avatar(tmp_path / "model.pt")), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_nothing_moves_or_fades_for_gloss() -> None:
+    avatar = make_avatar(normals=True, gloss=True)
+    posed, keep = avatar.pose(VERTS)
+    window = avatar.window(posed, keep, VIEW, K, 33, 30, roi=False)
+    for channel, moves in ((2, True), (5, True), (8, False)):
+        grads = torch.autograd.grad(
+            window.features[channel].sum(), [avatar.billboards.mu, avatar.billboards.alpha_logit], retain_graph=True,
+            allow_unused=True,
+        ) if window.features[channel].requires_grad else [None]  # fmt: skip
+        assert any(g is not None and bool(g.abs().max() > 0) for g in grads) == moves
+
+
 def test_files_from_before_there_were_forms_hold_the_papers(tmp_path) -> None:
     avatar = make_avatar()
     save_avatar(tmp_path / "model.pt", avatar)
@@ -244,6 +282,7 @@ def test_files_from_before_there_were_forms_hold_the_papers(tmp_path) -> None:
     assert content["architecture"].pop("unet_form") == "paper"
     assert content["architecture"].pop("normals") is False
     assert content["architecture"].pop("shading") is False
+    assert content["architecture"].pop("gloss") is False
     torch.save(content, tmp_path / "model.pt")
     for a, b in zip(render(avatar), render(load_avatar(tmp_path / "model.pt")), strict=True):
         assert torch.equal(a, b)

@@ -38,13 +38,13 @@ VERTS = {
 }
 
 
-def make_avatar(*, deferred: bool = True, texels: int = 4, normals: bool = False) -> Avatar:
+def make_avatar(*, deferred: bool = True, texels: int = 4, normals: bool = False, gloss: bool = False) -> Avatar:
     torch.manual_seed(3)
     faces = {"head": torch.from_numpy(OCTAHEDRON_FACES), "right_hand": torch.from_numpy(TETRAHEDRON_FACES)}
     channels = 4 if deferred else 3
     features, logits = torch.randn(12, texels, texels, channels), torch.randn(12, texels, texels)
     billboards = Billboards(torch.full((12, 2), 0.7), features, logits)
-    architecture = Architecture(channels, texels, deferred, 4, 3, 16, 1, True, 0.1, "ray", normals=normals)
+    architecture = Architecture(channels, texels, deferred, 4, 3, 16, 1, True, 0.1, "ray", normals=normals, gloss=gloss)
     return Avatar(architecture, faces, {"head": 6, "right_hand": 4}, billboards).eval()
 
 
@@ -53,10 +53,10 @@ def picture(avatar, verts=VERTS, *, K=K, viewmat=VIEW, size=(SIZE, SIZE)) -> tor
         return avatar.render(verts, viewmat, K, *size, BACKGROUND)[0]
 
 
-@pytest.mark.parametrize(("deferred", "normals"), [(True, False), (True, True), (False, False)])
+@pytest.mark.parametrize(("deferred", "told"), [(True, False), (True, True), (False, False)])
 @pytest.mark.parametrize("size", [(64, 64), (50, 37)])
-def test_the_default_setting_is_the_avatar_bit_by_bit(deferred: bool, normals: bool, size: tuple[int, int]) -> None:
-    avatar = make_avatar(deferred=deferred, normals=normals)
+def test_the_default_setting_is_the_avatar_bit_by_bit(deferred: bool, told: bool, size: tuple[int, int]) -> None:
+    avatar = make_avatar(deferred=deferred, normals=told, gloss=told)
     with torch.no_grad():
         expected = avatar.render(VERTS, VIEW, K, *size, BACKGROUND)
     given = TunedAvatar(avatar, SettingConfig()).render(VERTS, VIEW, K, *size, BACKGROUND)
