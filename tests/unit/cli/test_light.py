@@ -22,7 +22,7 @@ K = np.array([[2.2 * SIZE, 0, 0.5 * SIZE], [0, 2.2 * SIZE, 0.5 * SIZE], [0, 0, 1
 
 @pytest.fixture(scope="module")
 def studio(tmp_path_factory):
-    """A patched ball for a head that turns in the light of one lamp and a little from everywhere, seen by two cameras."""
+    """A patched ball for a head, which turns in the light of a lamp and a little from everywhere; two cameras."""
     folder = tmp_path_factory.mktemp("studio")
     rest, faces = sphere(3, 0.15)
     turns = Rotation.from_euler("yxz", [[14.0 * n, 9.0 * n, 5.0 * n] for n in range(FRAMES)], degrees=True).as_matrix()
@@ -71,7 +71,7 @@ def test_the_lamp_is_found_and_drawn(studio, tmp_path, capsys) -> None:
     assert _light(folder, paths, *words, "--picture", str(picture)) == 0
     assert "of how skin changes in frames left out" in capsys.readouterr().out
     light = read_light(out)
-    # Most of the light comes from within 25 degrees of the lamp: of the true one 1.1 / 4 of the sum, and 0.3 all around.
+    # Light from everywhere has no mean direction, so that of all lights is the lamp's.
     mean = light.weights @ light.directions
     assert mean @ LAMP[0] / np.linalg.norm(mean) > np.cos(np.radians(15.0))
     assert read_arrays(out)[1]["light"]["explained"] > 0.8
