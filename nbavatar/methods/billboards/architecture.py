@@ -46,7 +46,12 @@ class Architecture:
         )  # fmt: skip
 
 
-def check_stored(a: Architecture, refinement: Mapping[str, Any] | None, state: Mapping[str, Tensor]) -> None:
+def check_stored(
+    a: Architecture,
+    refinement: Mapping[str, Any] | None,
+    state: Mapping[str, Tensor],
+    vertex_counts: Mapping[str, int],
+) -> None:
     """Compares the sizes that a file names with the tensors that are there, before anything is made of such a size.
 
     Raises:
@@ -65,10 +70,26 @@ def check_stored(a: Architecture, refinement: Mapping[str, Any] | None, state: M
     if a.gloss and not a.normals:
         raise ValueError("gloss without normals")
     if a.shading:
-        found = list(state["shading.directions"].shape), list(state["shading.weights"].shape)
-        if found[0][1:] != [3] or found[1] != found[0][:1]:
-            raise ValueError(f"lights of {found[0]} with weights of {found[1]}")
+        _check_light(state, vertex_counts)
     if refinement is not None:
         for name, value in state.items():
             if name.startswith("refinement.bend_") and len(value) != len(refinement["frames"]):
                 raise ValueError(f"{name} of {len(value)} frames instead of {len(refinement['frames'])}")
+
+
+def _check_light(state: Mapping[str, Tensor], vertex_counts: Mapping[str, int]) -> None:
+    """Lights of the studio, and the faces that throw shadows: of every part, or of none."""
+    directions, weights = state["shading.directions"], state["shading.weights"]
+    if list(directions.shape) != [len(weights), 3] or weights.ndim != 1:
+        raise ValueError(f"lights of {list(directions.shape)} with weights of {list(weights.shape)}")
+    if not bool((weights >= 0).all() and torch.isfinite(weights).all() and torch.isfinite(directions).all()):
+        raise ValueError("a light of a negative weight, or that is no number")
+    start = "shading.occluders_"
+    occluders = {name.removeprefix(start): value for name, value in state.items() if name.startswith(start)}
+    if occluders and set(occluders) != set(vertex_counts):
+        raise ValueError(f"shadows of {', '.join(occluders)} for {', '.join(vertex_counts)}")
+    for part, faces in occluders.items():
+        if faces.ndim != 2 or faces.shape[1] != 3 or faces.is_floating_point():
+            raise ValueError(f"{start}{part} of {faces.dtype} {list(faces.shape)}")
+        if faces.numel() and not 0 <= int(faces.min()) <= int(faces.max()) < vertex_counts[part]:
+            raise ValueError(f"{start}{part} from {int(faces.min())} to {int(faces.max())}")

@@ -141,12 +141,16 @@ class Avatar(MeshAvatar):
         points, keep = self.merged(verts, refined)
         faces = self.faces if keep is None else self.faces[keep]
         frames = face_frames(points, faces)
-        return Anchor(frames, matrix_to_quaternion(frames.R), keep, self._light(points, faces, frames, verts), penalty)
+        lit, normals = points, frames.R[..., 2].detach()
+        if self.refinement is not None and frame is not None and (self.architecture.normals or self.shading):
+            # A mesh that is refined moves to where it is seen, not to be lit.
+            lit, _ = self.merged(verts)
+            normals = face_frames(lit, faces).R[..., 2]
+        light = self._light(lit, faces, normals, verts)
+        return Anchor(frames, matrix_to_quaternion(frames.R), keep, light, penalty)
 
-    def _light(self, points: Tensor, faces: Tensor, frames: FaceFrames, verts: Mapping[str, Tensor]) -> Tensor:
+    def _light(self, points: Tensor, faces: Tensor, normals: Tensor, verts: Mapping[str, Tensor]) -> Tensor:
         """What the decoder is told of the light on these faces, (F, L)."""
-        # A mesh that is refined moves to where it is seen, not to be lit.
-        normals = frames.R[..., 2].detach()
         told = [normals] if self.architecture.normals else [normals[:, :0]]
         if self.shading is not None:
             first, start = {}, 0
@@ -363,7 +367,7 @@ class Avatar(MeshAvatar):
     def rebuild(cls, content: Mapping[str, Any], state: Mapping[str, Tensor], record: Mapping[str, Any]) -> "Avatar":
         """An avatar of the stored shape, its values still to be loaded."""
         architecture = Architecture(**content["architecture"])
-        check_stored(architecture, content["refinement"], state)
+        check_stored(architecture, content["refinement"], state, content["vertex_counts"])
         if "billboards.sizes" in state:
             billboards = SizedBillboards.of_state(architecture.texels, state, "billboards.")
         else:

@@ -11,6 +11,7 @@ from nbavatar.errors import DataError
 from nbavatar.mesh.incidence import incidence, sphere_directions
 from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.compression.reduce import keep_billboards, keep_parts
+from nbavatar.methods.billboards.refine import Refinement
 from nbavatar.methods.billboards.shading import Shading
 from nbavatar.methods.storage import load_avatar, save_avatar
 from tests.unit.methods.billboards.test_model import VERTS, make_avatar, render
@@ -87,6 +88,23 @@ def test_what_is_pruned_still_throws_shadows(tmp_path) -> None:
     torch.testing.assert_close(_told(head, CLOSE), _told(avatar, {"head": CLOSE["head"]}), atol=1e-6, rtol=0)
 
 
+def _occluders(vertex: int) -> dict[str, torch.Tensor]:
+    faces = torch.tensor([[0, 1, 2], [1, 2, vertex]], dtype=torch.int32)
+    return {"shading.occluders_head": faces, "shading.occluders_right_hand": faces[:1]}
+
+
+def test_what_is_refined_is_lit_as_it_came() -> None:
+    refinement = Refinement(["a"], {part: torch.randn(len(v), 2) for part, v in VERTS.items()}, rigid=True)
+    with torch.no_grad():
+        for value in refinement.parameters():
+            value += 0.05 * torch.randn(value.shape)
+    avatar = lit_avatar()
+    avatar.refinement = refinement
+    with torch.no_grad():
+        plain, refined = avatar.pose(CLOSE)[0], avatar.pose(CLOSE, "a")[0]
+    assert not torch.equal(plain.means, refined.means) and torch.equal(plain.light, refined.light)
+
+
 def test_light_is_stored_with_the_avatar(tmp_path) -> None:
     avatar = lit_avatar()
     save_avatar(tmp_path / "model.pt", avatar)
@@ -95,6 +113,11 @@ def test_light_is_stored_with_the_avatar(tmp_path) -> None:
     for change in (
         lambda c: c["state"].pop("shading.weights"),
         lambda c: c["state"].update({"shading.weights": torch.ones(4)}),
+        lambda c: c["state"].update({"shading.weights": -torch.ones(5)}),
+        lambda c: c["state"].update({"shading.directions": torch.full((5, 3), torch.nan)}),
+        lambda c: c["state"].update({"shading.occluders_head": torch.zeros(2, 3, dtype=torch.int32)}),
+        lambda c: c["state"].update(_occluders(6)),
+        lambda c: c["state"].update(_occluders(-1)),
         lambda c: c["architecture"].update(shading=False),
     ):
         content = torch.load(tmp_path / "model.pt", weights_only=True)
