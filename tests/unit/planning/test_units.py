@@ -13,7 +13,14 @@ from nbavatar.config.sheets import Row
 from nbavatar.errors import ConfigError
 from nbavatar.planning import units
 from nbavatar.planning.figures import Shown, shown
-from nbavatar.planning.parameters import comparison_text, figure_code, method_of, protocol_text, stage_text
+from nbavatar.planning.parameters import (
+    comparison_text,
+    figure_code,
+    method_of,
+    protocol_text,
+    stage_text,
+    takes_light,
+)
 from nbavatar.planning.paths import constraints, fill
 from tests.scenes.capture import write_capture
 from tests.unit.planning.plans import ROOT, shipped
@@ -111,6 +118,21 @@ def test_meshes_come_from_the_last_stage_that_a_run_has(tmp_path):
     assert stages("given", 6, 0.0) == {"full": "align", "fit": "align", "tracks": "tracks", "bald": "align"}
     assert stages("given", 0, 0.0) == {"full": "tracks", "fit": "tracks", "tracks": "tracks", "bald": "tracks"}
     assert stages("solve", 6, 0.2) == {"full": "deform", "fit": "shell", "tracks": "tracks", "bald": "deform"}
+
+
+def test_light_is_for_billboards_that_decode_it(tmp_path):
+    root = str(write_capture(tmp_path / "toy"))
+    own = {
+        "full": {},
+        "no_light": {"billboards": {"shading": False}},
+        "no_dnr": {"billboards": {"deferred": False}},
+        "gaussian_avatars": {"method": "gaussian_avatars"},
+    }
+    variants = {name: {"crop": "full", "meshes": "fit", "stages": {"train": train}} for name, train in own.items()}
+    for lights in (64, 0):
+        plan = shipped("capture", data_root=root, variants=variants, stages={"light": {"lights": lights}})
+        assert {name for name in variants if takes_light(plan, name)} == ({"full"} if lights else set())
+    assert not takes_light(shipped("paper"), "full")
 
 
 def test_of_a_single_camera_no_view_is_held_out(tmp_path):
