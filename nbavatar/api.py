@@ -172,6 +172,7 @@ def train(
     out: str | os.PathLike[str],
     *,
     spectral: str | os.PathLike[str] | None = None,
+    light: str | os.PathLike[str] | None = None,
     start: str | os.PathLike[str] | None = None,
     device: str = "auto",
     **options: Any,
@@ -183,6 +184,7 @@ def train(
         meshes: mesh sequence (.npz).
         out: model.pt to write; `<out>.state/` beside it keeps what a later call resumes from.
         spectral: spectral coordinates (.npz); needed for `init="spectral"`, which is the default.
+        light: the studio's lights (.npz, `nbavatar light`), of which billboards are told what reaches each face.
         start: model.pt of another avatar of the same method, to begin with what fits of it.
         device: `auto`, `cpu` or `cuda`.
         options: of `TrainConfig` (config/README.md), such as `steps=2000, billboards={"texels": 8}`.
@@ -192,9 +194,10 @@ def train(
     """
     from nbavatar.cli.train import main
 
+    files = {"spectral": spectral, "light": light, "start": start}
     given = argparse.Namespace(
         frames=[os.fspath(path) for path in frames], meshes=os.fspath(meshes), out=os.fspath(out), history=None,
-        spectral=None if spectral is None else os.fspath(spectral), start=None if start is None else os.fspath(start),
+        **{name: None if path is None else os.fspath(path) for name, path in files.items()},
         device=device, max_minutes=None, preset=None, presets=None, cfg=json.dumps(options), set=[],
     )  # fmt: skip
     if main(given) != 0:

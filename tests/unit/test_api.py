@@ -11,6 +11,7 @@ from PIL import Image
 
 import nbavatar
 from nbavatar.camera.pinhole import project
+from nbavatar.data.lights import Light, write_light
 from nbavatar.methods.storage import save_avatar
 from tests.scenes.toy import camera, sequence, write_scene
 from tests.unit.methods.billboards.test_model import make_avatar
@@ -91,6 +92,10 @@ def test_an_avatar_is_trained_from_python_and_the_example_shows_it(tmp_path) -> 
     avatar = nbavatar.train(out=tmp_path / "model.pt", **given, **options)
     config = avatar.record["config"]
     assert config["steps"] == 3 and config["billboards"]["rates"]["features"] == 1e-3
+    light = Light(np.eye(3, dtype=np.float32), np.array([1, 1, 2], np.float32))
+    write_light(tmp_path / "light.npz", light, {})
+    lit = nbavatar.train(out=tmp_path / "lit.pt", light=tmp_path / "light.npz", **given, **options)
+    assert lit.shading.weights.tolist() == [1, 1, 2] and avatar.shading is None
     with pytest.raises(nbavatar.NBAvatarError, match="unknown key 'stepz'"):
         nbavatar.train(out=tmp_path / "other.pt", **given, stepz=3)
     example = [sys.executable, str(ROOT / "examples" / "render_avatar.py"), "model.pt", "scene/meshes.npz", "new.png"]
