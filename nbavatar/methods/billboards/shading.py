@@ -80,7 +80,7 @@ class Shading(nn.Module):
         arrays = [value.detach().cpu().numpy() for value in (points, faces, normals, self.directions, self.weights)]
         digest = hashlib.blake2b(repr(list(first)).encode())
         for array in arrays:
-            digest.update(np.ascontiguousarray(array))
+            digest.update(array.tobytes())
         key = digest.digest()
         told = self._kept.pop(key, None)
         if told is None:
