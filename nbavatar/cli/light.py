@@ -103,7 +103,8 @@ class _Scene:
             where = ", ".join(str(pack.path) for pack in packs)
             raise DataError.of(where, "split", expected="a training frame with a mesh", found="none")
         self._rows = _evenly(sorted(there), cfg.frames)
-        count = sum(len(part.faces) for part in sequence.parts.values())
+        self._labels = np.concatenate([np.full(len(p.faces), _label(name)) for name, p in sequence.parts.items()])
+        count = len(self._labels)
         self._faces = np.sort(np.random.default_rng(0).permutation(count)[: cfg.faces])
         self._place = np.full(count, -1)
         self._place[self._faces] = np.arange(len(self._faces))
@@ -165,8 +166,7 @@ class _Scene:
         face, _, _ = rasterize_mesh(
             verts, faces, lens.K, lens.width, lens.height, cam_from_world=self.cameras[index].cam_from_world
         )
-        part = np.concatenate([np.full(len(p.faces), _label(name)) for name, p in self._sequence.parts.items()])
-        usable = (face >= 0) & (label == part[numbers][face]) & (alpha >= _COVERED)
+        usable = (face >= 0) & (label == self._labels[numbers][face]) & (alpha >= _COVERED)
         return face, image, usable
 
 

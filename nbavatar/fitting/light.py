@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nbavatar.data.lights import Light
+from nbavatar.io.images import linear_light
 
-__all__ = ["Brightness", "add_picture", "estimate_light", "linear_light"]
+__all__ = ["Brightness", "add_picture", "estimate_light"]
 
 _SEEN = 3  # frames in which a face must be seen to say something
 _FRAMES = 6  # fewest frames to tell light from skin
@@ -51,13 +52,6 @@ class Brightness(NamedTuple):
     pixels: np.ndarray
 
 
-def linear_light(rgb: np.ndarray) -> np.ndarray:
-    """Linear brightness in [0, 1], float64 (...), mean over the channels of sRGB colours uint8 (..., 3)."""
-    value = np.arange(256) / 255.0
-    table = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return table[rgb].mean(-1)
-
-
 def add_picture(
     seen: Brightness, row: int, rgb: np.ndarray, usable: np.ndarray, face: np.ndarray, chosen: np.ndarray
 ) -> None:
@@ -73,7 +67,7 @@ def add_picture(
     place = np.where(face >= 0, chosen[face], -1)
     ok = usable & (place >= 0)
     count = seen.light.shape[1]
-    seen.light[row] += np.bincount(place[ok], linear_light(rgb[ok]), minlength=count)
+    seen.light[row] += np.bincount(place[ok], linear_light(rgb[ok]).mean(-1), minlength=count)
     seen.pixels[row] += np.bincount(place[ok], minlength=count)
 
 

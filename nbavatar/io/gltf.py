@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from nbavatar.io.atomic import atomic_write
+from nbavatar.io.images import linear_light
 
 __all__ = ["Shape", "write_glb"]
 
@@ -121,7 +122,7 @@ def _mesh(shape: Shape, buffer: _Buffer, document: dict[str, Any]) -> dict[str, 
         attributes["TEXCOORD_0"] = buffer.accessor(np.asarray(shape.uv, np.float32), _VERTICES)
     if shape.colours is not None:
         opaque = np.ones((len(shape.colours), 4), np.float32)
-        opaque[:, :3] = _linear(shape.colours)
+        opaque[:, :3] = linear_light(shape.colours)  # vertex colours of glTF are linear
         attributes["COLOR_0"] = buffer.accessor(opaque, _VERTICES)
     material: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
     if shape.texture is not None:
@@ -153,9 +154,3 @@ def _animation(nodes: int, frames: int, fps: float, buffer: _Buffer) -> dict[str
         "samplers": [{"input": times, "output": weights, "interpolation": "LINEAR"}],
         "channels": [{"sampler": 0, "target": {"node": i, "path": "weights"}} for i in range(nodes)],
     }
-
-
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """Light in [0, 1] of sRGB bytes: vertex colours of glTF are linear."""
-    value = np.asarray(colours, np.float64) / 255.0
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -9,7 +9,7 @@ from PIL import Image
 
 from nbavatar.errors import DataError
 
-__all__ = ["decode_image", "encode_png"]
+__all__ = ["decode_image", "encode_png", "linear_light"]
 
 _FORMATS = ("PNG", "JPEG", "WEBP")
 
@@ -47,3 +47,10 @@ def decode_image(source: bytes | str | os.PathLike[str], name: str | None = None
         raise DataError.of(label, expected="an image", found="no such file") from error
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError.of(label, expected="a whole image", found=f"one that does not decode ({error})") from error
+
+
+def linear_light(colours: np.ndarray) -> np.ndarray:
+    """Light in [0, 1] of sRGB bytes, float64 of their shape: the transfer function undone (IEC 61966-2-1)."""
+    value = np.arange(256) / 255.0
+    table = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return table[np.asarray(colours)]

@@ -10,6 +10,7 @@ opacity is the picture's.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -146,18 +147,17 @@ class Avatar(MeshAvatar):
             # A mesh that is refined moves to where it is seen, not to be lit.
             lit, _ = self.merged(verts)
             normals = face_frames(lit, faces).R[..., 2]
-        light = self._light(lit, faces, normals, verts)
+        light = self._light(lit, faces, normals, keep)
         return Anchor(frames, matrix_to_quaternion(frames.R), keep, light, penalty)
 
-    def _light(self, points: Tensor, faces: Tensor, normals: Tensor, verts: Mapping[str, Tensor]) -> Tensor:
+    def _light(self, points: Tensor, faces: Tensor, normals: Tensor, keep: Tensor | None) -> Tensor:
         """What the decoder is told of the light on these faces, (F, L)."""
         told = [normals] if self.architecture.normals else [normals[:, :0]]
         if self.shading is not None:
-            first, start = {}, 0
-            for part, count in self.vertex_counts.items():
-                if part in verts and bool(torch.isfinite(verts[part]).all()):
-                    first[part] = start
-                start += count
+            groups = self.face_groups()
+            shown = torch.unique(groups if keep is None else groups[keep.cpu()]).tolist()
+            starts = [0, *accumulate(self.vertex_counts.values())]
+            first = {self.parts[i]: starts[i] for i in shown}
             told.append(self.shading(points, faces, normals, first))
         return torch.cat(told, dim=1)
 

@@ -14,7 +14,7 @@ from nbavatar.io.images import decode_image
 from nbavatar.mesh.incidence import incidence
 from nbavatar.mesh.zbuffer import rasterize_mesh
 from tests.scenes.toy import camera
-from tests.unit.mesh.shapes import sphere
+from tests.unit.mesh.shapes import face_normals, sphere
 
 SIZE, FRAMES, LAMP = 128, 9, np.array([[0.6, -0.64, -0.48]])  # towards the cameras' side, from above
 K = np.array([[2.2 * SIZE, 0, 0.5 * SIZE], [0, 2.2 * SIZE, 0.5 * SIZE], [0, 0, 1]])
@@ -41,9 +41,7 @@ def studio(tmp_path_factory):
         }  # fmt: skip
         pictures = []
         for placed in verts.astype(np.float64):
-            cross = np.cross(placed[faces[:, 1]] - placed[faces[:, 0]], placed[faces[:, 2]] - placed[faces[:, 0]])
-            normals = cross / np.linalg.norm(cross, axis=1, keepdims=True)
-            shine = 0.3 + 1.1 * incidence(placed, faces, normals, LAMP)[0]
+            shine = 0.3 + 1.1 * incidence(placed, faces, face_normals(placed, faces), LAMP)[0]
             face, _, _ = rasterize_mesh(placed, faces, K, SIZE, SIZE, cam_from_world=view)
             linear = np.where((face >= 0)[..., None], (albedo * shine[:, None])[face], 0.02)
             srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)

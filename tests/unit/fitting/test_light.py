@@ -3,20 +3,16 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nbavatar.fitting.light import Brightness, add_picture, estimate_light, linear_light
+from nbavatar.fitting.light import Brightness, add_picture, estimate_light
+from nbavatar.io.images import linear_light
 from nbavatar.mesh.incidence import incidence, sphere_directions
 from nbavatar.mesh.zbuffer import joined_meshes
-from tests.unit.mesh.shapes import sphere
+from tests.unit.mesh.shapes import face_normals, sphere
 
 FRAMES = 12
 LIGHTS = sphere_directions(96)
 # Two lamps that are none of the lights tried.
 LAMPS = np.array([[0.6, 0.64, 0.48], [-0.8, 0.0, 0.6]])
-
-
-def _normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    cross = np.cross(verts[faces[:, 1]] - verts[faces[:, 0]], verts[faces[:, 2]] - verts[faces[:, 0]])
-    return cross / np.linalg.norm(cross, axis=1, keepdims=True)
 
 
 class _Turning:
@@ -37,7 +33,7 @@ class _Turning:
             own = Rotation.from_euler("xyz", [0.0, 25.0 * n, 40.0 * n], degrees=True).as_matrix()
             place = np.array([0.13 * np.cos(0.4 * n), 0.1 * np.sin(0.4 * n), 0.09])
             verts, faces, _ = joined_meshes([(head[0] @ turn.T, head[1]), (hand[0] @ own.T + place, hand[1])])
-            normals = _normals(verts, faces)
+            normals = face_normals(verts, faces)
             incident.append(incidence(verts, faces, normals, LIGHTS, side=128))
             lamps = LAMPS if still else LAMPS @ turn.T
             lit = 0.02 * incidence(verts, faces, normals, sphere_directions(40), side=128).sum(0)
@@ -102,5 +98,5 @@ def test_pictures_add_up_by_face() -> None:
     # sRGB's 188 is half the light (IEC 61966-2-1): ((188/255 + 0.055) / 1.055)^2.4 = 0.5029.
     np.testing.assert_allclose(seen.light, [[0.0, 1.0], [2 * 0.5029, 2.0]], atol=1e-4)
     np.testing.assert_allclose(
-        linear_light(np.array([[255, 0, 0], [10, 10, 10]], np.uint8)), [1 / 3, 0.003035], atol=1e-6
+        linear_light(np.array([[255, 0, 0], [10, 10, 10]], np.uint8)).mean(-1), [1 / 3, 0.003035], atol=1e-6
     )

@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-__all__ = ["grid", "sphere", "torus"]
+__all__ = ["face_normals", "grid", "sphere", "torus"]
 
 
 def sphere(subdivisions: int = 3, radius: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -38,3 +38,9 @@ def grid(nx: int, ny: int, width: float = 1.0, height: float = 1.0) -> tuple[np.
     return verts, np.concatenate(
         (np.stack((p, p + ny, p + ny + 1), -1).reshape(-1, 3), np.stack((p, p + ny + 1, p + 1), -1).reshape(-1, 3))
     )
+
+
+def face_normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals of faces that have an area, (F, 3)."""
+    cross = np.cross(verts[faces[:, 1]] - verts[faces[:, 0]], verts[faces[:, 2]] - verts[faces[:, 0]])
+    return cross / np.linalg.norm(cross, axis=1, keepdims=True)

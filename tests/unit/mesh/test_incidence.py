@@ -6,19 +6,14 @@ import pytest
 
 from nbavatar.mesh.incidence import incidence, sphere_directions
 from nbavatar.mesh.zbuffer import joined_meshes
-from tests.unit.mesh.shapes import sphere, torus
-
-
-def _normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    cross = np.cross(verts[faces[:, 1]] - verts[faces[:, 0]], verts[faces[:, 2]] - verts[faces[:, 0]])
-    return cross / np.linalg.norm(cross, axis=1, keepdims=True)
+from tests.unit.mesh.shapes import face_normals, sphere, torus
 
 
 def _by_rays(verts: np.ndarray, faces: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """The same by a ray from each centroid to each light."""
     tree = igl.AABB()
     tree.init(verts, faces)
-    normals, centres = _normals(verts, faces), verts[faces].mean(1)
+    normals, centres = face_normals(verts, faces), verts[faces].mean(1)
     found = np.zeros((len(directions), len(faces)))
     for k, direction in enumerate(directions):
         cosine = normals @ direction
@@ -41,13 +36,13 @@ def test_shadows_are_those_of_rays() -> None:
     verts, faces = _scene()
     directions = sphere_directions(12)
     exact = _by_rays(verts, faces, directions)
-    found = incidence(verts, faces, _normals(verts, faces), directions, side=512)
+    found = incidence(verts, faces, face_normals(verts, faces), directions, side=512)
     wrong = np.abs(found - exact)
-    shadowed = (exact == 0) & (_normals(verts, faces) @ directions.T > 0.1).T
+    shadowed = (exact == 0) & (face_normals(verts, faces) @ directions.T > 0.1).T
     assert shadowed.mean() > 0.05  # there are shadows to find
     # Borders of shadows, one pixel of the map or 0.01 wide, cross one face in a hundred.
     assert (wrong > 0.2).mean() < 0.01 and wrong.mean() < 0.004
-    coarse = np.abs(incidence(verts, faces, _normals(verts, faces), directions, side=64) - exact)
+    coarse = np.abs(incidence(verts, faces, face_normals(verts, faces), directions, side=64) - exact)
     assert wrong.mean() < 0.5 * coarse.mean()
 
 
@@ -56,7 +51,7 @@ def test_a_convex_body_does_not_shadow_itself(side: int) -> None:
     verts, faces = sphere(4)
     verts = verts * [1.0, 0.6, 1.7] + [300.0, -20.0, 5.0]
     directions = sphere_directions(20)
-    normals = _normals(verts, faces)
+    normals = face_normals(verts, faces)
     expected = np.maximum(directions @ normals.T, 0.0)
     steep = expected > 0.25  # where light grazes, faces hide centroids by less than a pixel of the map
     found = incidence(verts, faces, normals, directions, side=side)
@@ -66,7 +61,7 @@ def test_a_convex_body_does_not_shadow_itself(side: int) -> None:
 
 def test_neither_threads_nor_units_nor_place_matter() -> None:
     verts, faces = _scene()
-    normals, directions = _normals(verts, faces), sphere_directions(30)
+    normals, directions = face_normals(verts, faces), sphere_directions(30)
     once = incidence(verts, faces, normals, directions, workers=1)
     assert np.array_equal(once, incidence(verts, faces, normals, directions, workers=3))
     # Powers of two are exact.
@@ -77,7 +72,7 @@ def test_what_is_not_lit_may_throw_shadows() -> None:
     verts, faces = _scene()
     ball = faces[:1280]
     up = np.array([[0.0, 0.0, 1.0]])
-    normals = _normals(verts, ball)
+    normals = face_normals(verts, ball)
     alone = incidence(verts, ball, normals, up)
     below = incidence(verts, ball, normals, up, occluders=faces)
     steep = normals[:, 2] > 0.25

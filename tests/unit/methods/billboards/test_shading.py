@@ -14,6 +14,7 @@ from nbavatar.methods.billboards.compression.reduce import keep_billboards, keep
 from nbavatar.methods.billboards.refine import Refinement
 from nbavatar.methods.billboards.shading import Shading
 from nbavatar.methods.storage import load_avatar, save_avatar
+from tests.unit.mesh.shapes import face_normals
 from tests.unit.methods.billboards.test_model import VERTS, make_avatar, render
 
 LIGHT = Light(sphere_directions(5).astype(np.float32), np.array([0.5, 0.0, 1.5, 1.2, 0.8], np.float32))
@@ -42,8 +43,7 @@ def test_the_decoder_is_told_how_much_light_each_face_gets(normals: bool) -> Non
     told = _told(avatar, CLOSE)
     assert told.shape == (12, 4 if normals else 1) and not told.requires_grad
     points, faces = torch.cat(list(CLOSE.values())).numpy().astype(float), avatar.faces.numpy()
-    cross = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
-    unit = cross / np.linalg.norm(cross, axis=1, keepdims=True)
+    unit = face_normals(points, faces)
     reached = LIGHT.weights.astype(float) @ incidence(points, faces, unit, LIGHT.directions)
     # Normals of float32 vertices.
     np.testing.assert_allclose(((told[:, -1].numpy() + 1) / 2) ** 2.2, reached, atol=2e-6)
