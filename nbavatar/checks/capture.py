@@ -25,6 +25,7 @@ from nbavatar.data.capture import (
 from nbavatar.data.mesh_checks import mesh_faults
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
+from nbavatar.io.framepack import UNSEEN, unseen_in
 from nbavatar.mesh.topology import mesh_defects
 from nbavatar.preprocess.capture_masks import CameraMasks, open_masks
 from nbavatar.preprocess.supplied_masks import supplied_masks
@@ -75,6 +76,7 @@ class _Collector:
 
     def __init__(self, lines: list[str]) -> None:
         self._lines, self._groups = lines, {}
+        self.labels: set[int] = set()
 
     def attempt(self, group: str, call: Callable[[], Any]) -> Any:
         """The call's result, or None after noting its error."""
@@ -147,6 +149,8 @@ def check_capture(
         _check_camera(capture, camera, report, found, judge, progress)
     if meshes:
         _check_poses(root, judge, report, found)
+    if UNSEEN in found.labels:
+        _check_hidden(root, report, found)
     if len(cameras) == 1:
         report.notes.append(f"{root / 'cameras.json'}: one camera only; held-out poses are judged, new views are not")
     _notes_on_topology(root, report)
@@ -306,13 +310,13 @@ def _check_masks(
     found: _Collector,
     judge: PoseJudge,
 ) -> None:
-    """Looks at (frame, mask) of one camera: labels 0..3, or mattes of the person."""
+    """Looks at (frame, mask) of one camera: labels 0..3 and 255, or mattes of the person."""
     sampled, empty, labels, count = set(sampled_frames(report.frames)), [], set(), 0
     for frame, mask in masks:
         assert mask is not None
         person = mask if labelled else (mask > MATTE_THRESHOLD).astype(np.uint8)
         count += 1
-        if not person.any():
+        if not person[~unseen_in(person)].any():
             empty.append(frame)
         if labelled:
             labels |= set(np.unique(mask).tolist())
@@ -327,12 +331,25 @@ def _check_masks(
     elif empty:
         more = f" (and {len(empty) - 1} more frames)" if len(empty) > 1 else ""
         report.notes.append(f"{folder / empty[0]}: the mask is empty{more}")
-    for value in sorted(labels - {0}):
+    found.labels |= labels
+    for value in sorted(labels - {0, UNSEEN}):
         part = PARTS[value - 1]
         if report.topology and part not in report.topology:
             where = report.capture.root / "meshes" / "topology.npz" if report.capture else folder
             line = DataError.of(where, f"{part}_faces", expected=f"a mesh for label {value} of the masks", found="none")
             found.note(f"label {value}", str(line))
+
+
+def _check_hidden(root: Path, report: CaptureReport, found: _Collector) -> None:
+    """Refuses masks whose 255 seems to be meant for a part: one with a mesh and without its label in any mask."""
+    for part in report.topology:
+        label = PARTS.index(part) + 1
+        if label not in found.labels:
+            expected, fix = f"label {label} in a mask, as it has a mesh", f"store {label} where the part is seen"
+            line = DataError.of(
+                root / "masks", part, expected=expected, found="none, and 255 (something in front)", fix=fix
+            )
+            found.note(f"hidden {part}", str(line))
 
 
 def _check_poses(root: Path, judge: PoseJudge, report: CaptureReport, found: _Collector) -> None:

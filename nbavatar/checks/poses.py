@@ -17,6 +17,7 @@ from nbavatar.camera.distortion import distort_vertices
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
+from nbavatar.io.framepack import unseen_in
 from nbavatar.mesh.zbuffer import joined_meshes, rasterize_mesh
 
 __all__ = ["PoseJudge", "sampled_frames"]
@@ -157,10 +158,12 @@ class PoseJudge:
         )
 
     def add(self, camera: str, frame: str, mask: np.ndarray, *, labelled: bool) -> None:
-        """Takes one mask, `[H, W]` of the camera's size: labels 0..3, or above 0 wherever the person is."""
+        """Takes one mask, `[H, W]` of the camera's size: labels 0..3 and 255 (which says nothing), or above 0 wherever
+        the person is.
+        """
         step = self._step(self._cameras[camera])
         small = np.ascontiguousarray(mask[step // 2 :: step, step // 2 :: step])
-        if frame in self._meshes and small.any():
+        if frame in self._meshes and small[~unseen_in(small)].any():
             self._views.setdefault(camera, []).append(_View(frame, small, labelled))
             self._known.clear()
 
@@ -346,8 +349,9 @@ class PoseJudge:
         K = camera.K.copy()
         K[:2] /= self._step(camera)
         face, _, _ = rasterize_mesh(points, faces, K, width, height)
-        drawn = face >= 0
-        there = view.mask > 0
+        known = ~unseen_in(view.mask)
+        drawn = (face >= 0) & known
+        there = (view.mask > 0) & known
         both = float((drawn & there).sum())
         if view.labelled:
             # A part that is in the mask has to be drawn as well: it may lie outside the image.

@@ -24,8 +24,8 @@ from nbavatar.config.core import to_mapping
 from nbavatar.config.preprocess import CropConfig
 from nbavatar.data.sequences import read_sequence
 from nbavatar.errors import ConfigError, DataError
-from nbavatar.io.framepack import FramePack, FramePackWriter, mark_unseen
-from nbavatar.preprocess.crop import Window, resize_area, resize_labels
+from nbavatar.io.framepack import FramePack, FramePackWriter, mark_unseen, unseen_in
+from nbavatar.preprocess.crop import Window, resize_area, resize_labels, resize_unseen
 from nbavatar.preprocess.cropping import crop_extent, frame_boxes, plan_crop
 from nbavatar.preprocess.foreground import estimate_foreground
 from nbavatar.preprocess.sources import LAYERS, camera_of
@@ -73,17 +73,21 @@ def main(args: argparse.Namespace) -> None:
         if plan.moving:
             target["K_per_frame"] = {frame: plan.K[frame].tolist() for frame in frames}
         with FramePackWriter(args.out, target) as out:
-            window, unseen = None, np.zeros(0, bool)
+            window, outside = None, np.zeros(0, bool)
             for frame in progress(frames, f"crop {manifest['subject']}/{camera.name}", len(frames)):
                 if window is None or (window.x0, window.y0, window.side) != plan.windows[frame]:
                     window = Window(*plan.windows[frame], camera.K, camera.distortion)
-                    unseen = window.unseen(camera.height, camera.width, plan.size)
-                    out.manifest["unseen"] |= bool(unseen.any())
-                label = window.cut(masks.read("label", frame), labels=True)
+                    outside = window.unseen(camera.height, camera.width, plan.size)
+                label = masks.read("label", frame)
+                covered = window.cut(np.where(unseen_in(label), np.uint8(255), np.uint8(0))) > 0
+                label = window.cut(label, labels=True)
+                label[covered] = 0
                 alpha = window.cut(masks.read("alpha", frame))
                 rgb = window.cut(pack.read("rgb", frame))
                 rgb = resize_area(rgb, plan.size)
                 label, alpha = resize_labels(label, alpha, plan.size)
+                unseen = outside | resize_unseen(covered, plan.size)
+                out.manifest["unseen"] |= bool(unseen.any())
                 mark_unseen(label, alpha, unseen)
                 out.add("rgb", frame, estimate_foreground(rgb, alpha) if cfg.edge_color else rgb)
                 out.add("label", frame, label)

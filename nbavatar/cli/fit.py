@@ -124,7 +124,10 @@ def _read_bodies(assets: Assets, extras: dict[str, Any]) -> tuple[Bodies, dict[s
 
 
 def _read_masks(packs: dict[str, FramePack], frames: list[str], cfg: FitConfig) -> Masks | None:
-    """Masks of some frames that all packs have: labels of head and hands where there are any, else person mattes."""
+    """Masks of some frames that all packs have: labels of head and hands where there are any, else person mattes.
+
+    What says nothing counts as head or hand: there the meshes may be.
+    """
     layers = [layer for layer in ("label", "person") if packs and all(layer in pack.layers for pack in packs.values())]
     common = [i for i, frame in enumerate(frames) if all(frame in pack.frames for pack in packs.values())]
     if cfg.silhouette_weight == 0 or not layers or not common:

@@ -65,7 +65,7 @@ def main(args: argparse.Namespace) -> None:
         images = decaf_images(subject, camera, plan)
         names = ("videos", "segmentations", "cameras", "cutIDs")
         inputs = {str(name): path for name, path in zip(names, subject.camera_files(args.camera), strict=True)}
-        report["folder"] = subject.folder
+        report["folder"], unseen = subject.folder, False
     else:
         capture = open_capture(args.root, pixel_center=cfg.pixel_center)
         camera, report = capture.camera(args.camera), {}
@@ -76,6 +76,7 @@ def main(args: argparse.Namespace) -> None:
             report["masks"] = masks.summary()
         layers = capture_layers(masks)
         images = capture_images(capture, masks, plan.frames)
+        unseen = masks.mask is not None and masks.mask.unseen
         inputs = {name: capture.root / name for name in ("cameras.json", "splits.json")}
     extra = {
         "layout": args.layout,
@@ -87,6 +88,7 @@ def main(args: argparse.Namespace) -> None:
     record = run_record("ingest", config=to_mapping(cfg), inputs=inputs, extra=extra)
     meanings = {name: LAYERS[name] for name in layers}
     manifest = manifest_of(plan, camera, stage="ingest", subject=args.subject, layers=meanings, record=record)
+    manifest["unseen"] = unseen
     with FramePackWriter(args.out, manifest) as pack:
         for frame, pictures in progress(images, f"ingest {args.subject}/{args.camera}", len(plan.frames)):
             for layer, picture in pictures.items():

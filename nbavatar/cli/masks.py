@@ -2,15 +2,17 @@
 
 Reads a frame pack with `person` (a matte of the whole person, 0..255) or `label` masks, and a mesh sequence (.npz)
 with the same frames; or a capture's folders of masks and alpha images (--capture); or masks of your own (--supplied, or
-`supplied` in --cfg): FOLDER/[SUBJECT/]CAMERA/FRAME.png or FOLDER/[SUBJECT/]CAMERA.mp4, with labels 0..3 (images only,
-or video without loss) or mattes of the person.
+`supplied` in --cfg): FOLDER/[SUBJECT/]CAMERA/FRAME.png or FOLDER/[SUBJECT/]CAMERA.mp4, with labels 0..3 and 255 (images
+only, or video without loss) or mattes of the person.
 
 Writes a frame pack of the same frames, size and camera (still distorted):
 
-  label     uint8 [H, W]      0 background, 1 head with neck and hair, 2 right hand, 3 left hand (above the wrist)
+  label     uint8 [H, W]      0 background, 1 head with neck and hair, 2 right hand, 3 left hand (above the wrist),
+                              255 says nothing: something else is in front
   alpha     uint8 [H, W]      coverage, 255 = full
 
-Whatever is neither head nor hand (torso, arms) becomes background, unless `keep` is `person`. Holes and islands that
+Whatever is neither head nor hand (torso, arms) becomes background, unless `keep` is `person`; or 255 where it hides a
+mesh, if `covered` is `unknown`. Holes and islands that
 the meshes contradict are repaired, and so is what flickers in single frames. The record counts the pixels that each
 repair changed.
 """
@@ -65,7 +67,9 @@ def main(args: argparse.Namespace) -> None:
         margins = Margins(cfg.hair_margin, cfg.neck_margin, cfg.hand_margin, cfg.forearm_length)
         cutter = PartCutter(sequence, camera, margins, whole=cfg.keep == "person")
         runs = [frames[first : last + 1] for first, last in manifest.get("segments", [[0, len(frames) - 1]])]
-        numbers = MaskNumbers(cfg.threshold, cfg.hole_fraction, cfg.island_fraction, cfg.temporal, cfg.soft_alpha)
+        numbers = MaskNumbers(
+            cfg.threshold, cfg.hole_fraction, cfg.island_fraction, cfg.temporal, cfg.soft_alpha, cfg.covered
+        )
         statistics = MaskStatistics()
         supplied = args.supplied or cfg.supplied
         extra = {"subject": manifest["subject"], "camera": camera.name, "supplied": bool(supplied)}
@@ -87,6 +91,7 @@ def main(args: argparse.Namespace) -> None:
                 out.add("label", frame, label)
                 out.add("alpha", frame, alpha)
             record["pixels"] = dataclasses.asdict(statistics)
+            out.manifest["unseen"] = statistics.unseen > 0
             if statistics.labelled == 0:
                 raise DataError.of(
                     args.frames, f"camera {camera.name}", expected="pixels of a head or a hand in a frame at least",

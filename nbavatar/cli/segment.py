@@ -1,6 +1,6 @@
 """Masks for a capture that has none.
 
-  nbavatar segment CAPTURE --method sam3 --model DIR      head and hands, by SAM 3 and words: labels 0..3
+  nbavatar segment CAPTURE --method sam3 --model DIR      head and hands, by SAM 3 and words: labels 0..3, 255
   nbavatar segment CAPTURE --method person --model WHL    the whole person, by a small network: mattes 0..255, which the
                                                           stage `masks` cuts by the meshes
 
@@ -39,8 +39,10 @@ from nbavatar.data.capture import Capture, Splits, open_capture, read_rgb, read_
 from nbavatar.devices import lease_device
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.atomic import atomic_write
+from nbavatar.io.framepack import UNSEEN
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import write_json
+from nbavatar.preprocess.mask_values import labels_in
 from nbavatar.preprocess.overlay import contact_sheet, mask_outline
 from nbavatar.provenance import run_record
 
@@ -130,7 +132,7 @@ def _write_camera(
             empty += not mask.any()
             (temporary / f"{frame}.png").write_bytes(encode_png(mask))
             if frame in chosen:
-                label = mask if mask.max() <= 3 else (mask > 127).astype(np.uint8)
+                label = mask if labels_in(mask) - {UNSEEN} else (mask > 127).astype(np.uint8)
                 shown.append((f"{camera.name} {frame}", mask_outline(image, label)))
         if empty == len(frames):
             fix = "try other prompts, or the other method"

@@ -43,7 +43,8 @@ class SegmentConfig:
 
     prompts: dict[str, str] = option(
         {"head": "head", "right_hand": "right hand"},
-        "sam3: what the model is asked for, by part (head, right_hand, left_hand). It follows one object a prompt.",
+        "sam3: what the model is asked for, by part (head, right_hand, left_hand), and as `covered` what hides parts, "
+        "such as clothes (label 255). It follows one object a prompt.",
     )
     refine: bool = option(
         True, "person: look a second time, at the person only, and fit the matte's edge to the picture's."

@@ -73,7 +73,8 @@ class MasksConfig:
     supplied: str = option(
         "",
         "Folder with masks of your own, used instead of the dataset's: [<subject>/]<camera>/<frame>.png or "
-        "[<subject>/]<camera>.mp4; labels 0..3 (not in lossy files), or mattes of the person, to be cut by the meshes.",
+        "[<subject>/]<camera>.mp4; labels 0..3 and 255 (not in lossy files), or mattes of the person, to be cut by the "
+        "meshes.",
     )
     threshold: int = option(
         MATTE_THRESHOLD, "A matte above this is foreground; mask videos are lossy [0..255].", min=0, max=254
@@ -93,6 +94,12 @@ class MasksConfig:
     clothes: bool = option(True, "Tell collars from necks by colour (mattes only) and leave them out.")
     clothes_evidence: float = option(
         1.0, "How much likelier cloth has to be than head, as a natural logarithm [1].", min=0.0
+    )
+    covered: str = option(
+        "background",
+        "What counts in a matte as where something that is neither head nor hand (a collar, a sleeve) hides a mesh: "
+        "background; or unknown, where nothing is learnt and nothing judged. Masks with labels say so by 255.",
+        choices=("background", "unknown"),
     )
     hole_fraction: float = option(0.002, "Holes smaller than this share of the part are filled [1].", min=0.0, max=1.0)
     island_fraction: float = option(

@@ -15,11 +15,12 @@ import torch
 import torch.nn.functional as F
 
 from nbavatar.errors import DependencyError, require
+from nbavatar.io.framepack import UNSEEN
 
 __all__ = ["GET", "LABELS", "Sam3"]
 
 GET = "hf download facebook/sam3 --local-dir DIR, after its licence has been accepted there"
-LABELS = {"head": 1, "right_hand": 2, "left_hand": 3}
+LABELS = {"head": 1, "right_hand": 2, "left_hand": 3, "covered": UNSEEN}
 _TOKENS = 32
 _KEPT = 40  # frames; the tracker looks back on 7 masks and 16 pointers
 
@@ -29,7 +30,7 @@ class Sam3:
 
     Args:
         folder: config.json, model.safetensors and the tokenizer's files.
-        prompts: part -> words; parts without words are not looked for.
+        prompts: part, or `covered` for what hides them (label 255) -> words; what has no words is not looked for.
         device: where it runs.
 
     Raises:

@@ -172,7 +172,11 @@ def _lies_on(hand: Hand, mask: np.ndarray, labels: bool) -> bool:
     under = _under(hand, mask)
     if not len(under):
         return False
-    return bool((under >= 2).mean() >= _ON_HAND if labels else (under > MATTE_THRESHOLD).mean() >= _ON_PERSON)
+    return bool(
+        np.isin(under, list(_LABELS.values())).mean() >= _ON_HAND
+        if labels
+        else (under > MATTE_THRESHOLD).mean() >= _ON_PERSON
+    )
 
 
 def _under(hand: Hand, mask: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ is compressed already; PNG, because it is lossless and everything opens it.
     label   0 background, 1 head, 2 right, 3 left hand   uint8 [H, W]
     alpha   coverage of the labelled parts, 255 = full   uint8 [H, W]
 
-In a crop that sticks out of the camera's image, what lies outside has the label 255, and the manifest tells by
-`unseen` whether there is any.
+Pixels that say nothing have the label 255: what lies outside the camera's image in a crop that sticks out of it, and
+what something else covers that is no part. The manifest tells by `unseen` whether there is any.
 """
 
 import contextlib
@@ -35,28 +35,29 @@ from nbavatar.io.pictures import MOST_PIXELS
 from nbavatar.io.records import canonical_json
 from nbavatar.names import check_name
 
-__all__ = ["FORMAT", "FramePack", "FramePackWriter", "mark_unseen", "unseen_in"]
+__all__ = ["FORMAT", "UNSEEN", "FramePack", "FramePackWriter", "mark_unseen", "unseen_in"]
 
 FORMAT = 1
-_UNSEEN = 255
+UNSEEN = 255
+"""Label of pixels that say nothing."""
 _MANIFEST = "manifest.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _REQUIRED = ("stage", "subject", "camera", "width", "height", "cam_from_world", "frames", "layers")
 
 
 def mark_unseen(label: np.ndarray, alpha: np.ndarray, unseen: np.ndarray) -> None:
-    """Marks, in place, pixels of which the camera's image says nothing: label 255, no coverage.
+    """Marks, in place, pixels that say nothing about the parts: label 255, no coverage.
 
     Args:
         label, alpha: uint8 `[H, W]`.
         unseen: bool `[H, W]`.
     """
-    label[unseen], alpha[unseen] = _UNSEEN, 0
+    label[unseen], alpha[unseen] = UNSEEN, 0
 
 
 def unseen_in(label: np.ndarray) -> np.ndarray:
     """Pixels that `mark_unseen` has marked in labels, bool of their shape."""
-    return label == _UNSEEN
+    return label == UNSEEN
 
 
 class FramePackWriter:
@@ -170,7 +171,7 @@ class FramePack:
         return decode_image(encoded, f"{self.path}: {name}")
 
     def unseen(self, frame: str) -> np.ndarray | None:
-        """Pixels of which the camera's image says nothing, bool `[H, W]`; None where there are none in any frame."""
+        """Pixels that say nothing about the parts, bool `[H, W]`; None where there are none in any frame."""
         return unseen_in(self.read("label", frame)) if self.manifest.get("unseen") else None
 
     def intrinsics(self, frame: str) -> np.ndarray:

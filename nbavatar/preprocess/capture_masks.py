@@ -1,7 +1,7 @@
 """Masks and alpha images of one camera of a capture: what they mean, and reading them."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ from nbavatar.config.preprocess import MATTE_THRESHOLD
 from nbavatar.data.capture import Capture, read_splits, read_topology
 from nbavatar.data.pictures import find_picture
 from nbavatar.errors import DataError
+from nbavatar.io.framepack import unseen_in
 from nbavatar.io.pictures import read_plane
-from nbavatar.preprocess.mask_values import LABELS, Meaning, ValueSurvey, spread
+from nbavatar.preprocess.mask_values import Meaning, ValueSurvey, spread
 
 __all__ = ["CameraMasks", "open_masks"]
 
@@ -38,7 +39,7 @@ class CameraMasks:
     coverage: Meaning | None
 
     def read_mask(self, frame: str) -> np.ndarray | None:
-        """Labels 0..3, or a matte 0..255 of the person (see `mask.kind`), uint8 `[H, W]`; None where it has none."""
+        """Labels 0..3 and 255, or a matte 0..255 of the person (see `mask.kind`), uint8 `[H, W]`; None without one."""
         return self._read("masks", frame, self.mask)
 
     def read_coverage(self, frame: str) -> np.ndarray | None:
@@ -67,10 +68,8 @@ def open_masks(capture: Capture, camera: Camera, frames: Sequence[str]) -> Camer
     masks, alpha = (_survey(capture, camera, kind, frames) for kind in ("masks", "alpha"))
     meaning = None
     if masks is not None:
-        parts: Sequence[str] = ()
-        if masks.largest == 1 and not _labelled_elsewhere(capture, camera):
-            parts = list(read_topology(capture.root))
-        meaning = masks.masks(capture.root / "masks" / camera.name, parts)
+        parts = list(read_topology(capture.root)) if masks.largest == 1 else []
+        meaning = masks.masks(capture.root / "masks" / camera.name, parts, _elsewhere(capture, camera))
     coverage = None if alpha is None else alpha.coverage(capture.root / "alpha" / camera.name)
     opened = CameraMasks(capture.root, camera, meaning, coverage)
     if meaning is not None and coverage is not None:
@@ -85,6 +84,8 @@ def _compare(masks: CameraMasks, frames: Sequence[str]) -> None:
     for frame in frames:
         mask, alpha = masks.read_mask(frame), masks.read_coverage(frame)
         if mask is not None and alpha is not None:
+            if least == 0:
+                mask, alpha = (np.where(unseen_in(mask), np.uint8(0), plane) for plane in (mask, alpha))
             masked += int((mask > least).sum())
             covered += int(((mask > least) & (alpha > MATTE_THRESHOLD)).sum())
             elsewhere += int(((mask <= least) & (alpha > MATTE_THRESHOLD)).sum())
@@ -118,13 +119,10 @@ def _picture(root: Path, kind: str, camera: str, frame: str) -> Path:
     return path
 
 
-def _labelled_elsewhere(capture: Capture, camera: Camera) -> bool:
-    """Whether another camera's masks hold the labels of hands, in some of the frames: this one may just not see any."""
+def _elsewhere(capture: Capture, camera: Camera) -> Iterator[np.ndarray]:
+    """Masks of the other cameras, in some of the frames."""
     for frame in spread(read_splits(capture.root).frames):
         for other in capture.cameras.values():
             path = find_picture(capture.root / "masks" / other.name, frame)
             if other.name != camera.name and path is not None:
-                top = int(read_plane(path, (other.width, other.height)).values.max(initial=0))
-                if 1 < top <= LABELS:
-                    return True
-    return False
+                yield read_plane(path, (other.width, other.height)).values

@@ -15,7 +15,7 @@ import numpy as np
 from nbavatar.camera.distortion import undistortion_map
 from nbavatar.camera.pinhole import crop_intrinsics
 
-__all__ = ["Window", "blank_unseen", "resize_area", "resize_labels"]
+__all__ = ["Window", "blank_unseen", "resize_area", "resize_labels", "resize_unseen"]
 
 _RIM = 2  # pixels at an image's border that cubic interpolation mixes with what lies outside
 
@@ -77,6 +77,14 @@ def resize_area(image: np.ndarray, size: int) -> np.ndarray:
     if side == size:
         return image
     return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA if size < side else cv2.INTER_CUBIC)
+
+
+def resize_unseen(unseen: np.ndarray, size: int) -> np.ndarray:
+    """Resizes a mask of pixels that say nothing, bool `[S, S]`: a smaller pixel with a part of one says nothing."""
+    if unseen.shape[0] == size or not unseen.any():
+        return unseen if unseen.shape[0] == size else np.zeros((size, size), bool)
+    share = resize_area(np.where(unseen, np.uint8(255), np.uint8(0)), size)
+    return share > (0 if size < unseen.shape[0] else 127)
 
 
 def resize_labels(label: np.ndarray, alpha: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

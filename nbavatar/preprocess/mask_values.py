@@ -4,22 +4,27 @@ A camera's masks hold labels 0..3, or they are mattes: near 0 for the background
 soft only along edges. That value may be 1, 100, 255 or 65535; mattes are scaled so that it becomes 255. All pictures of
 a camera are looked at before any of them is used, because one picture alone does not tell a label from a matte.
 
+Among labels, 255 stands for pixels that say nothing, as in the segmentation masks of PASCAL VOC: something else is in
+front there, such as a collar or a microphone.
+
 Everything else is refused with the values that were found: other tools' label numbers, labels stretched for viewing,
 labels that a lossy format has blurred.
 """
 
 import dataclasses
-from collections.abc import Collection, Sequence
+import itertools
+from collections.abc import Collection, Iterable, Sequence
 
 import cv2
 import numpy as np
 
 from nbavatar.errors import DataError
+from nbavatar.io.framepack import UNSEEN
 
-__all__ = ["LABELS", "Meaning", "ValueSurvey", "spread"]
+__all__ = ["LABELS", "Meaning", "ValueSurvey", "labels_in", "spread"]
 
 LABELS = 3
-"""Largest label."""
+"""Largest label of a part."""
 
 _END = 1 / 8  # share of the matte's range that counts as an end
 # Most of the foreground that may lie flat between the ends, and that may lie there at all: in masks of few values and
@@ -29,7 +34,10 @@ _FEW = 32
 _SOFT = 32  # a matte of more than two values has more than so many levels
 _FULL = 0.75  # a matte whose foreground is above this share of its format's range is not scaled
 _PATCH = 0.002  # share of a picture that is flat and holds labels, when the other pictures are mattes
-_FIX = "store 0 background, 1 head, 2 right hand, 3 left hand as png; or 0 and 255 for the whole person"
+_FIX = (
+    "store 0 background, 1 head, 2 right hand, 3 left hand, 255 something else in front, as png; or 0 and 255 for the "
+    "whole person"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,24 +47,27 @@ class Meaning:
     Attributes:
         kind: `label` (0..3) or `person` (a matte of the whole person).
         white: stored value of a matte that stands for full coverage; 0 for labels.
+        unseen: whether labels of 255 are among the masks: pixels that say nothing.
     """
 
     kind: str
     white: int
+    unseen: bool = False
 
     def read(self, values: np.ndarray, where: object) -> np.ndarray:
-        """Labels 0..3, or coverage 0..255: uint8 `[H, W]`.
+        """Labels 0..3 and 255, or coverage 0..255: uint8 `[H, W]`.
 
         Args:
             values: as stored, uint8 or uint16 `[H, W]`.
             where: file, for the error line.
 
         Raises:
-            DataError: a value above 3 among labels.
+            DataError: a value among labels that is none.
         """
         if self.kind == "label":
-            if values.max(initial=0) > LABELS:
-                raise DataError.of(where, "values", expected=f"labels 0..{LABELS}", found=int(values.max()), fix=_FIX)
+            wrong = values[(values > LABELS) & ~((values == UNSEEN) & self.unseen)]
+            if wrong.size:
+                raise DataError.of(where, "values", expected=f"labels 0..{LABELS}", found=int(wrong.max()), fix=_FIX)
             return values.astype(np.uint8)
         if self.white == 255 and values.dtype == np.uint8:
             return values
@@ -70,6 +81,12 @@ def spread(names: Sequence[str], most: int = 256) -> list[str]:
     return [names[int(place)] for place in places]
 
 
+def labels_in(values: np.ndarray) -> set[int]:
+    """Which of the labels 1..3 and 255 a picture holds; none where it holds anything else beside the background."""
+    there = set(np.unique(values).tolist()) - {0}
+    return there if there <= {*range(1, LABELS + 1), UNSEEN} else set()
+
+
 class ValueSurvey:
     """Which values the pictures of one camera hold, gathered picture by picture in any order."""
 
@@ -79,6 +96,7 @@ class ValueSurvey:
         self._labelled: list[str] = []
         self._above = 0
         self._pictures = 0
+        self._unseen = False
         self._lossy = False
 
     @property
@@ -107,23 +125,34 @@ class ValueSurvey:
         spread = cv2.dilate(values, kernel).astype(np.int32) - cv2.erode(values, kernel)
         flat = np.bincount(values[spread <= top // 32])
         self._flat[: len(flat)] += flat
+        labelled = flat[1 : LABELS + 1].sum() > _PATCH * values.size
         if top > LABELS:
             self._above += 1
-        elif flat[1:].sum() > _PATCH * values.size:
+            self._unseen |= bool(labelled and self._labels_alone(counts))
+        elif labelled:
             self._labelled.append(name)
 
-    def masks(self, where: object, parts: Collection[str]) -> Meaning:
+    def masks(self, where: object, parts: Collection[str], others: Iterable[np.ndarray] = ()) -> Meaning:
         """Meaning of masks.
 
         Args:
             where: folder or video, for error lines.
             parts: parts that have a mesh. Masks of 0 and 1 alone are labels where there is a head only, and mattes of
                 the whole person where anything else has a mesh.
+            others: pictures of other cameras, asked where this camera's own leave it open: 0 and 1 are labels too where
+                others hold the label of a hand, which this camera may just not see; 0 and 255 are where others hold 255
+                beside labels.
 
         Raises:
             DataError: neither labels nor a matte, or both.
         """
         top = self.largest
+        if top == UNSEEN and self._counts.nonzero()[0].tolist() == [0, UNSEEN]:
+            # Hard mattes are many and large, and labels that say nothing are in most pictures, if in any: a few tell.
+            if any({UNSEEN} < labels_in(values) for values in itertools.islice(others, _FEW)):
+                return Meaning("label", 0, unseen=True)
+        elif top == 1 and any(max(labels_in(values) - {UNSEEN}, default=0) > 1 for values in others):
+            parts = ()
         if top <= LABELS:
             if self._lossy and top > 0:
                 if not self._labelled:  # a matte that shows nobody, and the noise of its format
@@ -133,6 +162,8 @@ class ValueSurvey:
                 raise DataError.of(where, "values", expected=f"labels 0..{LABELS} or 0..255", found=found, fix=fix)
             meaning = Meaning("person", 1) if top == 1 and set(parts) - {"head"} else Meaning("label", 0)
             return self._with_background(meaning, where)
+        if self._unseen and not self._lossy and self._labels_alone(self._counts):
+            return self._with_background(Meaning("label", 0, unseen=True), where)
         if self._labelled and not self._lossy:
             found = f"{self._above} of {self._pictures} masks with values above 3, and labels in {self._labelled[0]}"
             raise DataError.of(where, expected="labels 0..3 in all masks, or 0..255 in all", found=found)
@@ -158,6 +189,12 @@ class ValueSurvey:
             found = f"none in {self._pictures} pictures"
             raise DataError.of(where, "values", expected="background (0) somewhere", found=found, fix=_FIX)
         return meaning
+
+    @staticmethod
+    def _labels_alone(counts: np.ndarray) -> bool:
+        """Whether all values that are there are labels, or that of pixels that say nothing."""
+        there = counts.nonzero()[0]
+        return bool(((there <= LABELS) | (there == UNSEEN)).all())
 
     def _few(self) -> bool:
         return not self._lossy and int((self._counts > 0).sum()) <= _FEW

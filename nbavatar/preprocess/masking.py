@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import cv2
 import numpy as np
 
+from nbavatar.io.framepack import mark_unseen, unseen_in
 from nbavatar.preprocess.clean import clean_labels, repair_flicker
 from nbavatar.preprocess.clothes import ClothesModel
 from nbavatar.preprocess.part_masks import PartCutter
@@ -22,6 +23,7 @@ class MaskNumbers:
     island_fraction: float
     temporal: bool
     soft_alpha: bool
+    covered: str = "background"
 
 
 @dataclasses.dataclass
@@ -34,6 +36,7 @@ class MaskStatistics:
     removed: int = 0
     filled: int = 0
     flicker: int = 0
+    unseen: int = 0
     empty_frames: list[str] = dataclasses.field(default_factory=list)
 
 
@@ -44,6 +47,7 @@ class _Frame:
     coverage: np.ndarray | None
     label: np.ndarray
     support: np.ndarray
+    unseen: np.ndarray
 
 
 def cut_masks(
@@ -58,6 +62,9 @@ def cut_masks(
     clothes: ClothesModel | None = None,
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yields (frame, label uint8 `[H, W]`, alpha uint8 `[H, W]`) in the order of `masks`.
+
+    Pixels that say nothing have the label 255: those of the masks with labels, and of mattes, if `numbers.covered` is
+    `unknown`, where a part's mesh lies behind something that is neither head nor hand.
 
     Args:
         masks: (frame, mask, coverage or None) in time order.
@@ -98,6 +105,7 @@ def _prepare(
     clothes: ClothesModel | None,
 ) -> _Frame:
     outlines = cutter.silhouettes(name)
+    unseen = np.zeros(mask.shape, bool)
     if matte:
         label = cutter.cut(mask, outlines, numbers.threshold)
         if images is not None and clothes is not None:
@@ -107,15 +115,20 @@ def _prepare(
             statistics.clothes += int(cloth.sum())
             label[cloth] = 0
             outlines.support[cloth] = 0
-        statistics.dropped += int(((mask > numbers.threshold) & (label == 0)).sum())
+        other = (mask > numbers.threshold) & (label == 0)
+        statistics.dropped += int(other.sum())
+        if numbers.covered == "unknown":
+            unseen = other & outlines.meshes
     else:
-        label = mask
+        unseen = unseen_in(mask)
+        label = np.where(unseen, np.uint8(0), mask)
     cleaned = clean_labels(
         label, outlines.support, hole_fraction=numbers.hole_fraction, island_fraction=numbers.island_fraction
     )
+    cleaned = np.where(unseen, np.uint8(0), cleaned)  # a hole that is covered is none
     statistics.removed += int(((label > 0) & (cleaned == 0)).sum())
     statistics.filled += int(((label == 0) & (cleaned > 0)).sum())
-    return _Frame(name, mask, coverage, cleaned, outlines.support)
+    return _Frame(name, mask, coverage, cleaned, outlines.support, unseen)
 
 
 def _finish(
@@ -143,6 +156,11 @@ def _finish(
     statistics.labelled += int((label > 0).sum())
     if not label.any():
         statistics.empty_frames.append(now.name)
+    unseen = now.unseen & (label == 0)
+    if unseen.any():  # what is half a part and half its cover has neither's colour, and is no edge of the part
+        unseen |= (cv2.dilate(unseen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & (label > 0) & (alpha < 255)
+    statistics.unseen += int(unseen.sum())
+    mark_unseen(label, alpha, unseen)
     return now.name, label, alpha
 
 

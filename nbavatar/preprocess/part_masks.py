@@ -60,6 +60,7 @@ class Silhouettes:
         face: bool `[H, W]`, upper head, where no clothes are.
         neck: bool `[H, W]`, lower head and all around the surfaces, where clothes may be.
         torso: bool `[H, W]`, nearest to the collar: torso, if the matte has anything there.
+        meshes: bool `[H, W]`, where a part's mesh is, in front or behind a sleeve.
     """
 
     support: np.ndarray
@@ -68,6 +69,7 @@ class Silhouettes:
     face: np.ndarray
     neck: np.ndarray
     torso: np.ndarray
+    meshes: np.ndarray
 
 
 class PartCutter:
@@ -137,6 +139,10 @@ class PartCutter:
         width, height = self._camera.width, self._camera.height
         face, _, depth = rasterize_mesh(points, self._faces[self._solid], self._camera.K, width, height)
         face = np.where(face >= 0, np.flatnonzero(self._solid)[face], -1)
+        meshes = (face >= 0) & (self._owner[face] > 0)
+        if (sleeve := (face >= 0) & ~meshes).any():
+            own, _, _ = rasterize_mesh(points, self._faces[self._owner > 0], self._camera.K, width, height)
+            meshes |= sleeve & (own >= 0)
         if not self._solid.all():
             soft = np.flatnonzero(~self._solid)
             behind, _, far = rasterize_mesh(points, self._faces[soft], self._camera.K, width, height)
@@ -145,7 +151,7 @@ class PartCutter:
         support = np.where(face >= 0, self._owner[face], np.uint8(0))
         if not (face >= 0).any():
             nowhere = np.zeros(face.shape, dtype=bool)
-            return Silhouettes(support, support, np.zeros(face.shape, np.float32), nowhere, nowhere, nowhere)
+            return Silhouettes(support, support, np.zeros(face.shape, np.float32), nowhere, nowhere, nowhere, nowhere)
         distance, index = _nearest(face >= 0)
         near_face = face.reshape(-1)[index]
         pixels = (float(self._camera.K[0, 0]) / depth.reshape(-1)[index] * self._margin[near_face]).astype(np.float32)
@@ -160,6 +166,7 @@ class PartCutter:
             on_head & (height > _CLOTHES),
             (on_head & (height <= _CLOTHES)) | (face < 0),
             height < 0,
+            meshes,
         )
 
     def cut(self, matte: np.ndarray, silhouettes: Silhouettes, threshold: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from nbavatar.data.capture import Capture, read_rgb
 from nbavatar.data.decaf_files import DecafSubject
 from nbavatar.data.frame_plan import FramePlan
 from nbavatar.errors import DataError
-from nbavatar.io.framepack import FramePack
+from nbavatar.io.framepack import FramePack, mark_unseen, unseen_in
 from nbavatar.io.video import probe_video, read_video
 from nbavatar.preprocess.capture_masks import CameraMasks
 from nbavatar.preprocess.clean import spread_labels
@@ -22,7 +22,7 @@ __all__ = ["LAYERS", "camera_of", "capture_images", "capture_layers", "decaf_ima
 LAYERS = {
     "rgb": "colour, sRGB, uint8",
     "person": "matte of the whole person as delivered, 0..255",
-    "label": "0 background, 1 head, 2 right hand, 3 left hand",
+    "label": "0 background, 1 head, 2 right hand, 3 left hand, 255 says nothing",
     "alpha": "coverage of the labelled parts, 0..255",
 }
 
@@ -113,9 +113,12 @@ def frame_masks(masks: CameraMasks, frame: str) -> dict[str, np.ndarray]:
 
 
 def _agree(label: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels spread to all covered pixels; labels where nothing is covered are dropped."""
-    label = np.where(alpha > 0, label, np.uint8(0))
-    orphan = (alpha > 0) & (label == 0)
+    """Labels spread to all covered pixels; labels where nothing is covered are dropped. What says nothing stays so."""
+    unseen = unseen_in(label)
+    label = np.where((alpha > 0) & ~unseen, label, np.uint8(0))
+    orphan = (alpha > 0) & (label == 0) & ~unseen
     if orphan.any():
         label = np.where(orphan, spread_labels(label), label)
-    return label, np.where(label > 0, alpha, np.uint8(0))
+    alpha = np.where(label > 0, alpha, np.uint8(0))
+    mark_unseen(label, alpha, unseen)
+    return label, alpha

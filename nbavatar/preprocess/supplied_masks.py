@@ -11,7 +11,7 @@ from nbavatar.data.pictures import find_picture, list_pictures
 from nbavatar.errors import DataError
 from nbavatar.io.pictures import Plane, read_plane
 from nbavatar.io.video import probe_video, read_video
-from nbavatar.preprocess.mask_values import LABELS, Meaning, ValueSurvey, spread
+from nbavatar.preprocess.mask_values import Meaning, ValueSurvey, spread
 
 __all__ = ["supplied_masks"]
 
@@ -42,9 +42,7 @@ def supplied_masks(
     survey = ValueSurvey()
     for path, plane in read(place, frames, camera):
         survey.add(plane.values, plane.lossy, path.name)
-    if survey.largest == 1 and place.is_dir() and _labelled_beside(place):
-        parts = ()
-    meaning = survey.masks(place, parts)
+    meaning = survey.masks(place, parts, _beside(place) if place.is_dir() else ())
     return (meaning.read(plane.values, path) for path, plane in read(place, frames, camera)), meaning
 
 
@@ -82,12 +80,11 @@ def _from_video(path: Path, frames: Sequence[str], camera: Camera) -> Iterator[t
         raise DataError.of(path, "frames", expected=f"frame {frames[found]}", found="a video that ends before it")
 
 
-def _labelled_beside(folder: Path) -> bool:
-    """Whether another camera's images hold the labels of hands, in some frames: this one may just not see any."""
+def _beside(folder: Path) -> Iterator[np.ndarray]:
+    """Masks of the other cameras, in some of the frames."""
     for other in sorted(folder.parent.iterdir()):
         if other.is_dir() and other != folder:
             for name in spread(list(list_pictures(other))):
                 path = find_picture(other, name)
-                if path is not None and 1 < int(read_plane(path).values.max(initial=0)) <= LABELS:
-                    return True
-    return False
+                if path is not None:
+                    yield read_plane(path).values

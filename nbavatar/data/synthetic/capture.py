@@ -19,6 +19,7 @@ from nbavatar.data.synthetic.shading import ARM, CLOTH, HAND
 from nbavatar.data.synthetic.studio import Lens, lens_of, light_up, photograph
 from nbavatar.io.arrays import write_arrays
 from nbavatar.io.atomic import atomic_write
+from nbavatar.io.framepack import UNSEEN
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import write_json
 from nbavatar.mesh.zbuffer import rasterize_mesh
@@ -92,15 +93,25 @@ def write_capture(
 
 
 def labels_of(lens: Lens, figure: Figure, verts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Exact labels and coverage of head with hair and of the hand, uint8 (H, W), for posed vertices (V, 3) [m]."""
+    """Exact labels and coverage of head with hair and of the hand, uint8 (H, W), for posed vertices (V, 3) [m].
+
+    Where cloth or the arm hides one of them the label is 255.
+    """
     camera, s = lens.camera, lens.supersample
-    face, _, _ = rasterize_mesh(
-        verts, figure.faces, lens.K, lens.width, lens.height, cam_from_world=camera.cam_from_world, workers=1
+    other = np.isin(figure.material, (CLOTH, ARM))
+    face, own = (
+        rasterize_mesh(verts, faces, lens.K, lens.width, lens.height, cam_from_world=camera.cam_from_world, workers=1)[
+            0
+        ]
+        for faces in (figure.faces, figure.faces[~other])
     )
-    owner = np.select([np.isin(figure.material, (CLOTH, ARM)), figure.material == HAND], [0, _HAND], _HEAD)
+    owner = np.select([other, figure.material == HAND], [0, _HAND], _HEAD)
     part = np.where(face >= 0, owner[face], 0)
-    head, hand = ((part == p).reshape(camera.height, s, camera.width, s).mean((1, 3)) for p in (_HEAD, _HAND))
-    label = np.where(head + hand >= 0.5, np.where(head >= hand, _HEAD, _HAND), 0).astype(np.uint8)
+    part[(face >= 0) & (part == 0) & (own >= 0)] = UNSEEN
+    shares = ((part == p).reshape(camera.height, s, camera.width, s).mean((1, 3)) for p in (_HEAD, _HAND, UNSEEN))
+    head, hand, hidden = shares
+    label = np.where(hidden > 0, UNSEEN, 0)
+    label = np.where(head + hand >= 0.5, np.where(head >= hand, _HEAD, _HAND), label).astype(np.uint8)
     return label, np.round(255 * (head + hand)).astype(np.uint8)
 
 

@@ -181,6 +181,32 @@ def test_masks_supplied_elsewhere_are_checked_in_place_of_the_capture_s(capture,
     assert "right: frame t3: expected a mask" in errors(capfd)[0]
 
 
+def relabel(capture, change):
+    for path in capture.glob("masks/*/*.png"):
+        label = np.array(Image.open(path))
+        change(label)
+        Image.fromarray(label).save(path)
+
+
+def test_what_says_nothing_in_masks_is_no_defect(capture, tmp_path, capfd):
+    """A collar over the lower third of the picture, and a frame of one camera where nothing else is to be seen."""
+    assert main(["check", str(capture), "--record", str(tmp_path / "before.json")]) == 0
+    relabel(capture, lambda label: label.__setitem__(slice(50, None), 255))
+    path = capture / "masks/left/t1.png"
+    Image.fromarray(np.where(np.array(Image.open(path)) == 255, np.uint8(255), np.uint8(0))).save(path)
+    assert main(["check", str(capture), "--record", str(tmp_path / "after.json")]) == 0
+    before, after = (json.loads((tmp_path / f"{name}.json").read_text())["overlap"] for name in ("before", "after"))
+    for camera in before:
+        assert after[camera] > before[camera] - 0.05, "pixels that say nothing neither agree nor disagree"
+
+
+def test_a_part_that_is_255_wherever_it_should_be_seen_is_a_defect(capture, capfd):
+    relabel(capture, lambda label: label.__setitem__(label == 2, 255))
+    assert main(["check", str(capture)]) == 2
+    line = "masks: right_hand: expected label 2 in a mask, as it has a mesh, found none, and 255 (something in front)"
+    assert any(line in found for found in errors(capfd))
+
+
 def test_defects_may_be_said_only(capture, tmp_path, capfd):
     (capture / "images/left/t1.png").unlink()
     record = tmp_path / "r.json"

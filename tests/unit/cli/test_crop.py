@@ -6,7 +6,7 @@ import pytest
 from nbavatar.camera.pinhole import project
 from nbavatar.cli import main
 from nbavatar.data.sequences import read_sequence
-from nbavatar.io.framepack import FramePack
+from nbavatar.io.framepack import FramePack, FramePackWriter
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +70,31 @@ def test_what_the_camera_did_not_see_is_marked(prepared, tmp_path):
                     np.testing.assert_array_equal(pack.unseen(frame), outside)
                 else:
                     assert pack.unseen(frame) is None and pack.read("label", frame).max() < 4
+
+
+@pytest.mark.parametrize("size", [0, 48])
+def test_what_says_nothing_in_the_masks_says_nothing_in_the_crop(prepared, tmp_path, size):
+    with FramePack(prepared / "left.zip") as pack:
+        layers = {name: pack.manifest["layers"][name] for name in ("label", "alpha")}
+        with FramePackWriter(tmp_path / "masks.zip", {**pack.manifest, "layers": layers}) as out:
+            for frame in pack.frames:
+                label, alpha = pack.read("label", frame), pack.read("alpha", frame)
+                label[41:47, 31:51], alpha[41:47, 31:51] = 255, 0
+                out.add("label", frame, label)
+                out.add("alpha", frame, alpha)
+    assert crop(prepared, tmp_path / "c.zip", "--masks", str(tmp_path / "masks.zip"), kind="full", size=size) == 0
+    with FramePack(tmp_path / "c.zip") as pack, FramePack(prepared / "left.zip") as native:
+        assert pack.manifest["unseen"]
+        x0, y0, side = pack.manifest["record"]["window"]
+        scale = (size or side) / side
+        y, x = np.mgrid[0 : size or side, 0 : size or side] / scale
+        x, y = x + x0, y + y0
+        # A pixel of the crop spans [x, x + 1 / scale) of the picture.
+        touched = (x + 1 / scale > 31) & (x < 51) & (y + 1 / scale > 41) & (y < 47)
+        outside = (x < 0) | (y < 0) | (x >= native.manifest["width"]) | (y >= native.manifest["height"])
+        for frame in pack.frames:
+            np.testing.assert_array_equal(pack.unseen(frame), touched | outside)
+            assert not pack.read("alpha", frame)[touched].any()
 
 
 def test_box_covers_head_and_hand_with_its_margin(prepared, tmp_path):

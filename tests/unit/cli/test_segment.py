@@ -57,6 +57,18 @@ def test_sam3_labels_every_frame_and_draws_a_picture_a_camera(bare, tiny_sam3):
         assert json.loads((bare / "segment" / f"{camera}.json").read_text())["inputs"]["model"].startswith("sha256:")
 
 
+def test_sam3_marks_what_hides_parts(tiny_sam3):
+    from nbavatar.detection.sam3 import Sam3
+
+    pictures = np.random.default_rng(0).integers(0, 255, (3, 40, 50, 3), dtype=np.uint8)
+    found = {}
+    for part in ("head", "covered"):
+        found[part] = list(Sam3(tiny_sam3, {part: "clothes"}).run(iter(pictures)))
+    assert any(label.any() for label in found["head"])
+    for head, covered in zip(*found.values()):
+        np.testing.assert_array_equal(covered, np.where(head == 1, 255, 0))
+
+
 def test_sam3_forgets_frames_without_changing_what_it_finds(tiny_sam3, monkeypatch):
     from nbavatar.detection import sam3
 

@@ -136,6 +136,31 @@ def test_alpha_beyond_the_labels_spreads_them(capture):
         assert (images["label"][:5, 40:50] == 1).all() and (images["alpha"][:5, 40:50] == 77).all()
 
 
+def test_labels_that_say_nothing_stay_so_whatever_alpha_says(capture):
+    opened = open_capture(capture)
+    plan = plan_capture(opened, **CHOICE)
+    for frame in plan.frames:
+        path = capture / "masks/left" / f"{frame}.png"
+        label = np.array(Image.open(path))
+        label[30:40, 30:60] = 255
+        Image.fromarray(label).save(path)
+        alpha = np.full(label.shape, 255, np.uint8)
+        alpha[60:] = 0
+        (capture / "alpha/left").mkdir(parents=True, exist_ok=True)
+        Image.fromarray(alpha).save(capture / "alpha/left" / f"{frame}.png")
+    masks = open_masks(opened, opened.camera("left"), plan.frames)
+    assert masks.mask.unseen
+    for _, images in capture_images(opened, masks, plan.frames):
+        unseen = images["label"] == 255
+        assert unseen.sum() == 300 and unseen[30:40, 30:60].all()
+        np.testing.assert_array_equal(images["alpha"] > 0, np.isin(images["label"], (1, 2, 3)))
+    # The other camera never sees a part: what it has there says nothing either, and is nobody's matte.
+    for frame in plan.frames:
+        covered = np.where(np.arange(80)[:, None] > 50, np.uint8(255), np.zeros((80, 96), np.uint8))
+        Image.fromarray(covered).save(capture / "masks/right" / f"{frame}.png")
+    assert open_masks(opened, opened.camera("right"), plan.frames).mask.kind == "label"
+
+
 def test_person_masks_and_alpha_alone_are_left_for_the_meshes_to_cut(capture):
     opened = open_capture(capture)
     camera, frames = opened.camera("left"), plan_capture(opened, **CHOICE).frames

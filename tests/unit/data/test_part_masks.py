@@ -1,5 +1,7 @@
 """Masks on a scene whose truth is known: balls with a torso, a forearm and hair that no mesh covers."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -115,6 +117,52 @@ def test_labels_that_are_given_are_kept(scene):
     for (_, label, _), truth in zip(result, scene[3]):
         np.testing.assert_array_equal(label, truth)
     assert statistics.dropped == statistics.flicker == 0
+
+
+def behind(sequence, camera, row, *parts):
+    """Where the meshes of some parts are in a frame, whatever is in front of them."""
+    shown = np.zeros((HEIGHT, WIDTH), bool)
+    for part in (sequence.parts[name] for name in parts):
+        pose = camera.cam_from_world
+        face, _, _ = rasterize_mesh(part.verts[row], part.faces, camera.K, WIDTH, HEIGHT, cam_from_world=pose)
+        shown |= face >= 0
+    return shown
+
+
+def test_what_hides_a_mesh_may_say_nothing(scene):
+    """The forearm in front of the head, cloth over the lower head: known from the meshes and the true labels."""
+    sequence, camera, mattes, _ = scene
+    cutter = PartCutter(sequence, camera, MARGINS)
+    plain, _ = cut(scene, mattes)
+    found, statistics = cut(scene, mattes, numbers=dataclasses.replace(NUMBERS, covered="unknown"))
+    total, sleeve = 0, 0
+    for row, ((frame, before, _), (_, label, alpha)) in enumerate(zip(plain, found)):
+        unseen = label == 255
+        sleeve += int((unseen & (cutter.silhouettes(frame).support == 0)).sum())
+        np.testing.assert_array_equal(np.where(unseen, 0, label), before)
+        np.testing.assert_array_equal(alpha > 0, np.isin(label, (1, 2)))
+        wanted = behind(sequence, camera, row, "head", "right_hand") & (before == 0) & (mattes[row] > 0)
+        np.testing.assert_array_equal(unseen, wanted)
+        total += int(unseen.sum())
+    assert statistics.unseen == total > 200 and sleeve > 100, (total, sleeve)
+
+
+def test_labels_that_say_nothing_are_kept_and_take_half_covered_neighbours_with_them(scene):
+    masks = [truth.copy() for truth in scene[3]]
+    for mask in masks:
+        mask[80:84, 90:94] = 255  # a microphone: small enough for a hole that would be filled
+        assert (mask[78:86, 88:96] > 0).all()
+    coverage = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    coverage[80:84, 89] = 120  # what the microphone half covers
+    coverage[70:74, 89] = 120  # and another soft place, which nothing covers
+    result, statistics = cut(scene, masks, coverage=coverage, matte=False)
+    for (_, label, alpha), mask in zip(result, masks):
+        np.testing.assert_array_equal(label[80:84, 89:94], 255)
+        assert (label == 255).sum() == 20 and not alpha[label == 255].any()
+        same = label != 255
+        np.testing.assert_array_equal(label[same], mask[same])
+        assert (alpha[70:74, 89] == 120).all()
+    assert statistics.unseen == 20 * len(masks) and not statistics.empty_frames
 
 
 def test_coverage_is_carried_and_soft_edges_are_an_option(scene):

@@ -4,6 +4,7 @@ import hashlib
 import json
 from pathlib import Path
 
+import igl
 import numpy as np
 import pytest
 import torch
@@ -16,7 +17,12 @@ from nbavatar.camera.pinhole import project
 from nbavatar.cli import main
 from nbavatar.config.synthetic import CAMERAS, RECORD, refuse_others
 from nbavatar.data.capture import open_capture, read_mesh, read_topology
+from nbavatar.data.synthetic.capture import labels_of
 from nbavatar.data.synthetic.dataset import write_dataset
+from nbavatar.data.synthetic.figure import build_figure, pose_figure
+from nbavatar.data.synthetic.scene import build_bodies, make_scene
+from nbavatar.data.synthetic.shading import ARM, CLOTH
+from nbavatar.data.synthetic.studio import lens_of, make_cameras
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.images import decode_image
 from nbavatar.io.pickles import read_pickle
@@ -256,8 +262,31 @@ def test_a_subject_as_a_capture_passes_its_check_and_its_ponytail_is_in_no_mesh(
     camera, mesh = capture.camera("122"), read_mesh(capture, "00000", read_topology(root))
     label = decode_image(root / "masks/122/00000.png")
     alpha = decode_image(root / "alpha/122/00000.png")
-    assert np.array_equal(label > 0, alpha >= 128)
+    assert np.array_equal(np.isin(label, (1, 2)), alpha >= 128) and (label == 255).any()
     head = project(mesh["head"].astype(np.float64), camera.K, camera.cam_from_world)[0]
     x = np.flatnonzero((label == 1).any(0))
     assert x.max() > head[:, 0].max() + 8  # the ponytail, a tenth of the picture beyond the head
     assert abs(x.min() - head[:, 0].min()) < 5
+
+
+def test_labels_say_nothing_where_cloth_or_arm_hide_head_or_hand() -> None:
+    """Rays of libigl through pixels: the first face that they hit, and whether any is the head's or the hand's."""
+    scene = make_scene(build_bodies("tiny"), "S2", 2, 0, dents=False)
+    figure = build_figure(scene, "cap")
+    verts = pose_figure(figure, scene, 1)[0]
+    other = np.isin(figure.material, (ARM, CLOTH))
+    seen = {True: 0, False: 0}
+    for name, camera in make_cameras(("100", "121"), 96, 96, focal=2.3, distortion=0.0).items():
+        label, _ = labels_of(lens_of(camera, 1), figure, verts)
+        local = np.ascontiguousarray(verts @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3])
+        pixels = [tuple(p) for p in np.argwhere(label == 255)] + [
+            (y, x) for y in range(1, 96, 9) for x in range(1, 96, 9)
+        ]
+        for y, x in pixels:
+            ray = np.linalg.solve(camera.K, [x + 0.5, y + 0.5, 1.0])
+            hits = igl.ray_mesh_intersect(np.zeros(3), ray, local, figure.faces.astype(np.int64))
+            faces = [hit[0] for hit in sorted(hits, key=lambda hit: hit[1])]
+            hidden = bool(faces) and other[faces[0]] and not other[faces].all()
+            assert (label[y, x] == 255) == hidden, (name, y, x)
+            seen[hidden] += 1
+    assert min(seen.values()) > 40, seen

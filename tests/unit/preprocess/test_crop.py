@@ -5,7 +5,7 @@ import skimage.transform
 
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.camera.pinhole import crop_intrinsics, project, scale_intrinsics
-from nbavatar.preprocess.crop import Window, blank_unseen, resize_area, resize_labels
+from nbavatar.preprocess.crop import Window, blank_unseen, resize_area, resize_labels, resize_unseen
 
 K = np.array([[400.0, 0, 171.2], [0, 410.0, 118.6], [0, 0, 1]])
 
@@ -72,6 +72,19 @@ def test_an_undistorted_image_is_seen_as_far_as_its_pixels_reach(distortion):
     unseen = window.unseen(240, 340, 400)
     assert unseen[inside < 0].all() and not unseen[inside > 4].any()
     assert 0.01 < unseen.mean() < 0.9
+
+
+@pytest.mark.parametrize(
+    ("size", "rows", "columns"), [(64, (9, 12), (20, 21)), (32, (4, 6), (10, 11)), (16, (2, 3), (5, 6))]
+)
+def test_a_pixel_with_a_part_that_says_nothing_says_nothing(size, rows, columns):
+    unseen = np.zeros((64, 64), bool)
+    unseen[9:12, 20:21] = True
+    expected = np.zeros((size, size), bool)
+    expected[slice(*rows), slice(*columns)] = True
+    np.testing.assert_array_equal(resize_unseen(unseen, size), expected)
+    assert resize_unseen(unseen, 128)[18:24, 40:42].all() and resize_unseen(unseen, 128).sum() < 30
+    assert not resize_unseen(~unseen & unseen, size).any()
 
 
 def test_only_what_is_unseen_is_blanked():
