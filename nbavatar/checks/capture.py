@@ -5,11 +5,12 @@ import hashlib
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from nbavatar.camera.pinhole import Camera
+from nbavatar.checks.collector import Collector
 from nbavatar.checks.poses import PoseJudge, sampled_frames
 from nbavatar.config.cameras import read_rig, stored_test_camera
 from nbavatar.config.preprocess import MATTE_THRESHOLD
@@ -28,6 +29,7 @@ from nbavatar.errors import DataError
 from nbavatar.io.framepack import UNSEEN, unseen_in
 from nbavatar.mesh.topology import mesh_defects
 from nbavatar.preprocess.capture_masks import CameraMasks, open_masks
+from nbavatar.preprocess.mask_values import Meaning
 from nbavatar.preprocess.supplied_masks import supplied_masks
 
 __all__ = ["CaptureReport", "Supplied", "check_capture"]
@@ -58,6 +60,7 @@ class CaptureReport:
         frames: frame ids.
         topology: faces and rest vertices of the parts.
         masks: camera -> its masks, if they can be read.
+        meanings: camera -> what the masks that are used mean, if they can be read.
     """
 
     defects: list[str] = dataclasses.field(default_factory=list)
@@ -69,37 +72,7 @@ class CaptureReport:
     frames: list[str] = dataclasses.field(default_factory=list)
     topology: dict[str, tuple[np.ndarray, np.ndarray | None]] = dataclasses.field(default_factory=dict)
     masks: dict[str, CameraMasks] = dataclasses.field(default_factory=dict)
-
-
-class _Collector:
-    """Collects defects; many of one kind become one line with a count."""
-
-    def __init__(self, lines: list[str]) -> None:
-        self._lines, self._groups = lines, {}
-        self.labels: set[int] = set()
-
-    def attempt(self, group: str, call: Callable[[], Any]) -> Any:
-        """The call's result, or None after noting its error."""
-        try:
-            return call()
-        except DataError as error:
-            self.note(group, str(error))
-            return None
-
-    def note(self, group: str, line: str) -> None:
-        self._groups.setdefault(group, []).append(line)
-
-    def close(self) -> None:
-        alike: dict[str, dict[str, list[str]]] = {}
-        for group, lines in self._groups.items():
-            # One cause is often found in every camera: what expects the same is told once.
-            same = re.search(r"(?:(?<=: )\w+: )?(?:expected|unknown key) .*?(?=, found |; |$)", lines[0])
-            alike.setdefault(same[0] if same else group, {})[group] = lines
-        for groups in alike.values():
-            lines = [line for lines in groups.values() for line in lines]
-            where = f", in {', '.join(group.split()[-1] for group in groups)}" if len(groups) > 1 else ""
-            more = f" (and {len(lines) - 1} more like it{where})" if len(lines) > 1 else ""
-            self._lines.append(lines[0] + more)
+    meanings: dict[str, Meaning] = dataclasses.field(default_factory=dict)
 
 
 def check_capture(
@@ -124,7 +97,7 @@ def check_capture(
     """
     root = Path(root)
     report = CaptureReport(supplied=Supplied(supplied, subject))
-    found = _Collector(report.defects)
+    found = Collector(report.defects)
     if not root.is_dir():
         report.defects.append(f"{root}: expected the folder of a capture, found no such folder")
         return report
@@ -149,8 +122,8 @@ def check_capture(
         _check_camera(capture, camera, report, found, judge, progress)
     if meshes:
         _check_poses(root, judge, report, found)
-    if UNSEEN in found.labels:
-        _check_hidden(root, report, found)
+    if UNSEEN in found.labels and set(report.meanings) == set(cameras):
+        _check_hidden(Path(supplied) if supplied else root / "masks", report, found)
     if len(cameras) == 1:
         report.notes.append(f"{root / 'cameras.json'}: one camera only; held-out poses are judged, new views are not")
     _notes_on_topology(root, report)
@@ -158,7 +131,7 @@ def check_capture(
     return report
 
 
-def _cameras(root: Path, found: _Collector, pixel_center: float) -> dict[str, Camera]:
+def _cameras(root: Path, found: Collector, pixel_center: float) -> dict[str, Camera]:
     path = root / "cameras.json"
     cameras = {}
     for name, entry in read_rig(path).items():
@@ -176,7 +149,7 @@ def _cameras(root: Path, found: _Collector, pixel_center: float) -> dict[str, Ca
     return cameras
 
 
-def _check_meshes(capture: Capture, report: CaptureReport, found: _Collector) -> dict[str, dict[str, np.ndarray]]:
+def _check_meshes(capture: Capture, report: CaptureReport, found: Collector) -> dict[str, dict[str, np.ndarray]]:
     root = capture.root
     meshes: dict[str, dict[str, np.ndarray]] = {}
     first: dict[str, np.ndarray] = {}
@@ -208,7 +181,7 @@ def _check_meshes(capture: Capture, report: CaptureReport, found: _Collector) ->
     return meshes
 
 
-def _check_sizes(root: Path, meshes: dict[str, dict[str, np.ndarray]], found: _Collector) -> bool:
+def _check_sizes(root: Path, meshes: dict[str, dict[str, np.ndarray]], found: Collector) -> bool:
     """Notes parts that are no people's; whether all lengths are in another unit, which explains what else is wrong."""
     sizes = {
         (frame, part): float(np.linalg.norm(np.ptp(mesh[part], axis=0)))
@@ -241,7 +214,7 @@ def _check_camera(
     capture: Capture,
     camera: Camera,
     report: CaptureReport,
-    found: _Collector,
+    found: Collector,
     judge: PoseJudge,
     progress: Callable[[Iterable[str], str], Iterable[str]],
 ) -> None:
@@ -260,6 +233,7 @@ def _check_camera(
             f"supplied {name}", lambda: supplied_masks(folder, report.supplied.subject, camera, report.frames, parts)
         )
         if own is not None:
+            report.meanings[name] = own[1]
             shown = zip(report.frames, own[0])
             _check_masks(folder / name, camera, shown, own[1].kind == "label", report, found, judge)
     elif masks is not None and (masks.mask is not None or masks.coverage is not None):
@@ -268,6 +242,9 @@ def _check_camera(
             where, expected = capture.root / "masks" / name, f"masks as of camera {others[0]}"
             found.note(f"no mask {name}", str(DataError.of(where, expected=expected, found="none")))
         labelled, there = masks.mask is not None and masks.mask.kind == "label", masks.mask is not None
+        meaning = masks.mask or masks.coverage
+        assert meaning is not None
+        report.meanings[name] = meaning
         shown = ((frame, masks.read_mask(frame) if there else masks.read_coverage(frame)) for frame in report.frames)
         _check_masks(capture.root / "masks" / name, camera, shown, labelled, report, found, judge)
     elif masks is not None and report.frames:
@@ -280,7 +257,7 @@ def _check_images(
     capture: Capture,
     camera: Camera,
     frames: list[str],
-    found: _Collector,
+    found: Collector,
     moving: bool,
     progress: Callable[[Iterable[str], str], Iterable[str]],
 ) -> None:
@@ -307,7 +284,7 @@ def _check_masks(
     masks: Iterable[tuple[str, np.ndarray | None]],
     labelled: bool,
     report: CaptureReport,
-    found: _Collector,
+    found: Collector,
     judge: PoseJudge,
 ) -> None:
     """Looks at (frame, mask) of one camera: labels 0..3 and 255, or mattes of the person."""
@@ -330,7 +307,7 @@ def _check_masks(
         found.note(f"nothing {camera.name}", str(line))
     elif empty:
         more = f" (and {len(empty) - 1} more frames)" if len(empty) > 1 else ""
-        report.notes.append(f"{folder / empty[0]}: the mask is empty{more}")
+        report.notes.append(f"{folder / empty[0]}: the mask shows nobody{more}")
     found.labels |= labels
     for value in sorted(labels - {0, UNSEEN}):
         part = PARTS[value - 1]
@@ -340,19 +317,17 @@ def _check_masks(
             found.note(f"label {value}", str(line))
 
 
-def _check_hidden(root: Path, report: CaptureReport, found: _Collector) -> None:
+def _check_hidden(masks: Path, report: CaptureReport, found: Collector) -> None:
     """Refuses masks whose 255 seems to be meant for a part: one with a mesh and without its label in any mask."""
     for part in report.topology:
         label = PARTS.index(part) + 1
         if label not in found.labels:
             expected, fix = f"label {label} in a mask, as it has a mesh", f"store {label} where the part is seen"
-            line = DataError.of(
-                root / "masks", part, expected=expected, found="none, and 255 (something in front)", fix=fix
-            )
+            line = DataError.of(masks, part, expected=expected, found="none, and 255 (something in front)", fix=fix)
             found.note(f"hidden {part}", str(line))
 
 
-def _check_poses(root: Path, judge: PoseJudge, report: CaptureReport, found: _Collector) -> None:
+def _check_poses(root: Path, judge: PoseJudge, report: CaptureReport, found: Collector) -> None:
     path = root / "cameras.json"
     lines = judge.defects(path)
     report.overlap, report.astray = judge.overlaps(), judge.misfits()

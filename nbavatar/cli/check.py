@@ -166,7 +166,9 @@ def _outlined(report: CaptureReport, name: str, frame: str) -> np.ndarray | None
     masks = report.masks.get(name)
     if report.supplied.folder and report.capture is not None:
         folder, subject = report.supplied
-        own, meaning = supplied_masks(folder, subject, report.capture.cameras[name], [frame], tuple(report.topology))
+        if (meaning := report.meanings.get(name)) is None:
+            return None
+        own, _ = supplied_masks(folder, subject, report.capture.cameras[name], [frame], (), meaning)
         mask, labelled = next(own), meaning.kind == "label"
     elif masks is None:
         return None

@@ -24,7 +24,7 @@ def add_cfg_argument(parser: argparse.ArgumentParser, cls: type) -> None:
         default="{}",
         metavar="JSON|FILE",
         help=f"options of this stage ({cls.__name__}, see config/README.md) as JSON text, "
-        "or a .json or .yaml file; what is not named keeps the paper's value",
+        "or a .json or .yaml file; what is not named keeps its default",
     )
     parser.add_argument(
         "--set",

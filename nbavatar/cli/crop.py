@@ -4,7 +4,8 @@ Reads the frame packs of `nbavatar ingest` (rgb) and `nbavatar masks` (label, al
 from the first), and for box crops the mesh sequence with the tracked boxes. Writes a frame pack:
 
   rgb       uint8 [S, S, 3]   sRGB
-  label     uint8 [S, S]      0 background, 1 head, 2 right hand, 3 left hand, 255 outside the native image
+  label     uint8 [S, S]      0 background, 1 head, 2 right hand, 3 left hand, 255 nothing is known
+                              (something is in front, or outside the native image)
   alpha     uint8 [S, S]      coverage
 
 with K [px] of the cropped images (K_per_frame where boxes move), distortion null, and everything else as it was.

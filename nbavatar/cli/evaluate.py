@@ -124,10 +124,10 @@ def _evaluate(
     means = {}
     if cfg.trivial and training:
 
-        def images() -> Iterator[tuple[str, Any, Any]]:
+        def images() -> Iterator[tuple[str, Any, Any, Any]]:
             for camera, pack in training.items():
                 for frame in select_frames(pack.frames, pack.manifest.get("split", {}), "novel_view", cfg.mean_frames):
-                    yield camera, pack.read("rgb", frame), pack.read("alpha", frame)
+                    yield camera, pack.read("rgb", frame), pack.read("alpha", frame), pack.unseen(frame)
 
         means = mean_images(images(), protocol.background)
 
@@ -141,7 +141,7 @@ def _evaluate(
             coverage = render.read("alpha", name) if "alpha" in render.layers else None
             if coverage is not None and unseen is not None:
                 coverage = np.where(unseen, alpha, coverage)  # where nothing is known, nothing is wrong
-            yield Pair(camera, frame, prediction, pack.read("rgb", frame), alpha, coverage)
+            yield Pair(camera, frame, prediction, pack.read("rgb", frame), alpha, coverage, unseen)
 
     result = evaluate(
         progress(pairs(), f"evaluate {protocol.name}", len(render.frames)),

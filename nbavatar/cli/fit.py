@@ -40,7 +40,7 @@ from nbavatar.fitting.pictures import contact_sheet
 from nbavatar.fitting.stage import Bodies, Masks, fit_sequence
 from nbavatar.io.arrays import read_arrays
 from nbavatar.io.atomic import atomic_write
-from nbavatar.io.framepack import FramePack
+from nbavatar.io.framepack import FramePack, unseen_in
 from nbavatar.io.images import encode_png
 from nbavatar.provenance import run_record
 
@@ -126,7 +126,7 @@ def _read_bodies(assets: Assets, extras: dict[str, Any]) -> tuple[Bodies, dict[s
 def _read_masks(packs: dict[str, FramePack], frames: list[str], cfg: FitConfig) -> Masks | None:
     """Masks of some frames that all packs have: labels of head and hands where there are any, else person mattes.
 
-    What says nothing counts as head or hand: there the meshes may be.
+    What says nothing counts as head or hand, for there the meshes may be, but draws no contour to its border.
     """
     layers = [layer for layer in ("label", "person") if packs and all(layer in pack.layers for pack in packs.values())]
     common = [i for i, frame in enumerate(frames) if all(frame in pack.frames for pack in packs.values())]
@@ -139,7 +139,12 @@ def _read_masks(packs: dict[str, FramePack], frames: list[str], cfg: FitConfig) 
         camera: np.stack([pack.read(layer, frames[i]) > (0 if labels else MATTE_THRESHOLD) for i in chosen])
         for camera, pack in packs.items()
     }
-    return Masks(chosen, images, labels)
+    unseen = {}
+    if labels and any(pack.manifest.get("unseen") for pack in packs.values()):
+        unseen = {
+            name: np.stack([unseen_in(pack.read(layer, frames[i])) for i in chosen]) for name, pack in packs.items()
+        }
+    return Masks(chosen, images, labels, unseen)
 
 
 def _progress(part: str, step: Any) -> None:

@@ -78,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
             if opacity is not None and unseen is not None:
                 opacity[unseen] = 0
             rgb = blank_unseen(render.read("rgb", name), unseen, protocol.background)
-            return Images(camera, rgb, opacity, pack.read("rgb", frame), pack.read("alpha", frame))
+            return Images(camera, rgb, opacity, pack.read("rgb", frame), pack.read("alpha", frame), unseen)
 
         def truth(name: str) -> "np.ndarray":
             camera, _, frame = name.partition("/")

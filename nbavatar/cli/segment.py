@@ -35,14 +35,14 @@ from nbavatar.camera.pinhole import Camera
 from nbavatar.cli.common import add_cfg_argument, progress, stage_config
 from nbavatar.config.core import to_mapping
 from nbavatar.config.detection import SegmentConfig
+from nbavatar.config.preprocess import MATTE_THRESHOLD
 from nbavatar.data.capture import Capture, Splits, open_capture, read_rgb, read_splits
 from nbavatar.devices import lease_device
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.atomic import atomic_write
-from nbavatar.io.framepack import UNSEEN
+from nbavatar.io.framepack import unseen_in
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import write_json
-from nbavatar.preprocess.mask_values import labels_in
 from nbavatar.preprocess.overlay import contact_sheet, mask_outline
 from nbavatar.provenance import run_record
 
@@ -76,7 +76,7 @@ def main(args: argparse.Namespace) -> None:
         _refuse_taken(sheets / f"{camera.name}.png", "a picture")
     with _segmenter(args, cfg) as segment:
         for camera in cameras:
-            shown = _write_camera(capture, splits, camera, segment, out, cfg)
+            shown = _write_camera(capture, splits, camera, segment, out, cfg, args.method == "sam3")
             rows = [shown[i : i + 3] for i in range(0, len(shown), 3)]
             with atomic_write(sheets / f"{camera.name}.png") as path:
                 path.write_bytes(encode_png(contact_sheet(rows, cell=cfg.sheet_tile), level=6))
@@ -107,8 +107,9 @@ def _segmenter(args: argparse.Namespace, cfg: SegmentConfig) -> Iterator[Segment
 
     words = [text for text in cfg.prompts.values() if text]
     unknown = sorted(set(cfg.prompts) - set(LABELS))
-    if unknown or not words or len(set(words)) < len(words):
-        expected = f"different words for some of {', '.join(LABELS)}"
+    parts = [part for part, text in cfg.prompts.items() if text and part != "covered"]
+    if unknown or not parts or len(set(words)) < len(words):
+        expected = f"different words for some of {', '.join(LABELS)}, a part among them"
         raise ConfigError.of("--cfg", "prompts", expected=expected, found=str(cfg.prompts))
     if not args.model:
         raise ConfigError.of("--model", expected="the folder of SAM 3's weights", found="none")
@@ -117,9 +118,16 @@ def _segmenter(args: argparse.Namespace, cfg: SegmentConfig) -> Iterator[Segment
 
 
 def _write_camera(
-    capture: Capture, splits: Splits, camera: Camera, segment: Segmenter, out: Path, cfg: SegmentConfig
+    capture: Capture,
+    splits: Splits,
+    camera: Camera,
+    segment: Segmenter,
+    out: Path,
+    cfg: SegmentConfig,
+    *,
+    labelled: bool,
 ) -> list[tuple[str, np.ndarray]]:
-    """Writes all masks of a camera, or none; returns captioned pictures of some."""
+    """Writes all masks of a camera, labels or mattes, or none; returns captioned pictures of some."""
     frames = splits.frames
     chosen = {frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, cfg.sheet_frames).astype(int))}
     temporary = out / f".{camera.name}.{os.getpid()}.tmp"
@@ -129,10 +137,10 @@ def _write_camera(
         for frame, image, mask in progress(
             _masks(capture, splits, camera, segment), f"segment {camera.name}", len(frames)
         ):
-            empty += not mask.any()
+            label = mask if labelled else (mask > MATTE_THRESHOLD).astype(np.uint8)
+            empty += not (mask[~unseen_in(mask)] if labelled else mask).any()
             (temporary / f"{frame}.png").write_bytes(encode_png(mask))
             if frame in chosen:
-                label = mask if labels_in(mask) - {UNSEEN} else (mask > 127).astype(np.uint8)
                 shown.append((f"{camera.name} {frame}", mask_outline(image, label)))
         if empty == len(frames):
             fix = "try other prompts, or the other method"

@@ -11,7 +11,7 @@ and writes
   --picture  the head with the shell from four sides
 
 All that is found is relative to the head's size; nothing depends on the unit of length. The head's pixels behind
-another part, and what lies outside an image, are no evidence.
+another part or anything else, and what lies outside an image, are no evidence.
 """
 
 import argparse

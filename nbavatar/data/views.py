@@ -164,7 +164,7 @@ class ViewStore:
     Args:
         packs: opened frame packs.
         views: from `views_of`.
-        parts: parts that are modelled; pixels of other labelled parts, and those outside the camera's image, are
+        parts: parts that are modelled; pixels of other labelled parts, and those that say nothing (label 255), are
             marked as ignored.
         cache_bytes: most memory for decoded views [bytes].
     """
@@ -249,7 +249,10 @@ class ViewStore:
 
 
 def _average(pixels: np.ndarray, x0: int, y0: int, shrink: int) -> tuple[np.ndarray, int, int]:
-    """Block means of a rectangle at (x0, y0), on the grid of the whole picture."""
+    """Block means of a rectangle at (x0, y0), on the grid of the whole picture.
+
+    Of a block with a pixel that says nothing, nothing is known: half of its colour and coverage is missing.
+    """
     height, width, channels = pixels.shape
     if height == 0:
         return pixels, 0, 0
@@ -257,7 +260,9 @@ def _average(pixels: np.ndarray, x0: int, y0: int, shrink: int) -> tuple[np.ndar
     right, bottom = -(left + width) % shrink, -(top + height) % shrink
     padded = np.pad(pixels, ((top, bottom), (left, right), (0, 0)))
     blocks = padded.reshape(padded.shape[0] // shrink, shrink, padded.shape[1] // shrink, shrink, channels)
-    return blocks.mean((1, 3), dtype=np.float32), x0 // shrink, y0 // shrink
+    small = blocks.mean((1, 3), dtype=np.float32)
+    small[small[..., 4] > 0] = (0.0, 0.0, 0.0, 0.0, 1.0)
+    return small, x0 // shrink, y0 // shrink
 
 
 class ViewStream:

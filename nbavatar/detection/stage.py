@@ -14,6 +14,7 @@ from nbavatar.detection.squares import Square
 from nbavatar.detection.visibility import facing
 from nbavatar.detection.windows import frame_windows, mask_window
 from nbavatar.errors import DataError
+from nbavatar.io.framepack import unseen_in
 
 __all__ = ["COUNTS", "Detector", "keep_parts"]
 
@@ -52,7 +53,7 @@ class Detector:
 
         Args:
             frames: image uint8 `[H, W, 3]` RGB; mask uint8 `[H, W]` or None; whether the mask has labels (0 background,
-                1 head, 2 right, 3 left hand) or is a matte of the person.
+                1 head, 2 right, 3 left hand, 255 says nothing) or is a matte of the person.
             starts: positions of frames that nothing may be carried into, such as those after a cut.
 
         Yields:
@@ -172,11 +173,10 @@ def _lies_on(hand: Hand, mask: np.ndarray, labels: bool) -> bool:
     under = _under(hand, mask)
     if not len(under):
         return False
-    return bool(
-        np.isin(under, list(_LABELS.values())).mean() >= _ON_HAND
-        if labels
-        else (under > MATTE_THRESHOLD).mean() >= _ON_PERSON
-    )
+    if labels:
+        under = under[~unseen_in(under)]
+        return bool(len(under) and (under >= 2).mean() >= _ON_HAND)
+    return bool((under > MATTE_THRESHOLD).mean() >= _ON_PERSON)
 
 
 def _under(hand: Hand, mask: np.ndarray) -> np.ndarray:

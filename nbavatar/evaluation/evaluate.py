@@ -51,6 +51,7 @@ class Pair:
         rgb: uint8 [H, W, 3], true colours.
         alpha: uint8 [H, W], true coverage, 255 = full.
         coverage: uint8 [H, W], the render's, or None where it is not known.
+        unseen: bool [H, W], where the truth says nothing and has the background, as the prediction does; None: nowhere.
     """
 
     camera: str
@@ -59,6 +60,7 @@ class Pair:
     rgb: np.ndarray
     alpha: np.ndarray
     coverage: np.ndarray | None = None
+    unseen: np.ndarray | None = None
 
 
 def composite(rgb: np.ndarray, alpha: np.ndarray, background: Sequence[float]) -> np.ndarray:
@@ -75,28 +77,39 @@ def composite(rgb: np.ndarray, alpha: np.ndarray, background: Sequence[float]) -
 
 
 def mean_images(
-    images: Iterable[tuple[str, np.ndarray, np.ndarray]], background: Sequence[float]
+    images: Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray | None]], background: Sequence[float]
 ) -> dict[str, np.ndarray]:
     """Mean training image of each camera, and of all of them under the key ``''``.
 
+    A pixel is the mean over the images that say something of it, and has the background where none does.
+
     Args:
-        images: (camera, uint8 rgb [H, W, 3], uint8 alpha [H, W]), all of one size.
+        images: (camera, uint8 rgb [H, W, 3], uint8 alpha [H, W], bool [H, W] where it says nothing or None), all of one
+            size.
         background: sRGB in [0, 1].
 
     Returns:
         camera -> float32 [H, W, 3]; empty if there are no images.
     """
     sums: dict[str, np.ndarray] = {}
-    counts: dict[str, int] = {}
-    for camera, rgb, alpha in images:
+    counts: dict[str, np.ndarray] = {}
+    for camera, rgb, alpha, unseen in images:
         image = composite(rgb, alpha, background).astype(np.float64)
+        known = np.ones(image.shape[:2]) if unseen is None else np.where(unseen, 0.0, 1.0)
+        image *= known[..., None]
         for key in (camera, ""):
             if key in sums and sums[key].shape != image.shape:
                 size, other = sums[key].shape[:2], image.shape[:2]
                 raise DataError.of("training images", f"camera {camera}", expected=f"size {size}", found=other)
             sums[key] = sums[key] + image if key in sums else image
-            counts[key] = counts.get(key, 0) + 1
-    return {key: (total / counts[key]).astype(np.float32) for key, total in sums.items()}
+            counts[key] = counts[key] + known if key in counts else known
+    blank = np.asarray(background, np.float64)
+    return {
+        key: np.where(counts[key][..., None] > 0, total / np.maximum(counts[key], 1.0)[..., None], blank).astype(
+            np.float32
+        )
+        for key, total in sums.items()
+    }
 
 
 def measure(
@@ -233,8 +246,10 @@ def _evaluate(
                 image = _tensor(make(), device)
                 with torch.inference_mode():
                     known = {first: nets[first].features(image)} if first is not None else {}
-                cached[key] = (image, known)
-            image, known = cached[key]
+                if key:
+                    cached[key] = (image, known)
+            else:
+                image, known = cached[key]
             answers.setdefault(answer, []).append(
                 measure(image, truth, mask, nets, {name: features[name] for name in known}, known)
             )
@@ -257,7 +272,7 @@ def _evaluate(
 def _trivial_answers(
     pair: Pair, background: Sequence[float], means: Mapping[str, np.ndarray] | None
 ) -> Iterator[tuple[str, str, Callable[[], np.ndarray]]]:
-    """(answer, key under which its image is kept, function that makes the image)."""
+    """(answer, key under which its image is kept or "" where it is not, function that makes the image)."""
     shape = pair.rgb.shape
 
     def empty() -> np.ndarray:
@@ -270,7 +285,11 @@ def _trivial_answers(
             expected = f"{shape[1]}x{shape[0]}, as the truth"
             found = "x".join(map(str, means[camera].shape[1::-1]))
             raise DataError.of("training images", expected=expected, found=found)
-        yield "mean_image", f"mean of {camera}", lambda: means[camera]
+        unseen = pair.unseen
+        if unseen is None:
+            yield "mean_image", f"mean of {camera}", lambda: means[camera]
+        else:
+            yield "mean_image", "", lambda: np.where(unseen[..., None], empty(), means[camera])
 
 
 def _means(values: Sequence[Mapping[str, object]]) -> dict[str, float | None]:

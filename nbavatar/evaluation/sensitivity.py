@@ -31,13 +31,17 @@ _GROW = 0.01
 
 @dataclass(frozen=True)
 class Images:
-    """One rendered image and its truth, uint8: colours [H, W, 3], coverages [H, W] (255 = full)."""
+    """One rendered image and its truth, uint8: colours [H, W, 3], coverages [H, W] (255 = full).
+
+    Where the truth says nothing, if anywhere, `unseen` is true, bool [H, W].
+    """
 
     camera: str
     prediction: np.ndarray
     opacity: np.ndarray | None
     rgb: np.ndarray
     alpha: np.ndarray
+    unseen: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,10 @@ def apply_setting(
     """
     old = np.asarray(background, np.float32)
     new = old if setting.background is None else np.asarray(setting.background, np.float32)
-    coverage = _masked(images.alpha, setting.mask).astype(np.float32)[..., None] / 255
+    covered = _masked(images.alpha, setting.mask)
+    if images.unseen is not None:  # a grown mask does not reach where nothing is known and the render is blank
+        covered = np.where(images.unseen, np.uint8(0), covered)
+    coverage = covered.astype(np.float32)[..., None] / 255
     truth = coverage * (images.rgb.astype(np.float32) / 255) + (1 - coverage) * new
     prediction = images.prediction.astype(np.float32) / 255
     if setting.background is not None and images.opacity is not None:

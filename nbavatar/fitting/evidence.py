@@ -1,8 +1,8 @@
 """What the pixels of a labelled picture say about a part: there, not there, or nothing.
 
 The pictures of a capture are as recorded; here they are reduced and freed of the lens, so that a hull is carved by
-plain pinholes. Nothing is said by what another part covers, with a rim of some pixels for the error of labels, and by
-what the camera did not record.
+plain pinholes. Nothing is said by what another part or anything else (label 255) covers, with a rim of some pixels for
+the error of labels, and by what the camera did not record.
 """
 
 from collections.abc import Mapping

@@ -5,9 +5,9 @@ share of misses instead of none, because poses jitter and masks err):
 
     misses(x) / seen(x) <= limit,    seen: views in which x projects to a pixel with evidence
 
-A pixel is evidence of background, of the part, or of nothing: what another part covers, or the camera did
-not record, says nothing about what lies behind. Points that have missed too often for any outcome are dropped on the
-way, which changes no result and leaves a few views' worth of work.
+A pixel is evidence of background, of the part, or of nothing: what another part or anything else covers, or the camera
+did not record, says nothing about what lies behind. Points that have missed too often for any outcome are dropped on
+the way, which changes no result and leaves a few views' worth of work.
 """
 
 import dataclasses

@@ -4,7 +4,8 @@ A mask becomes a signed distance map (negative inside), sampled bilinearly. Two 
 
     matte   the whole person, hair and clothes included: sample points of the mesh may not lie outside
     labels  head and hands only: points on the mesh's rim (surface normal across the line of sight) that are near the
-            border have to lie on it, from either side; others may not lie outside
+            border have to lie on it, from either side, unless the border is that of something in front of them; others
+            may not lie outside
 
 Keypoints say nothing of the back of a head; contours do. Masks are used at reduced size and in a few frames spread over
 the sequence: what they add is mostly the shape, which all frames share.
@@ -19,8 +20,19 @@ from torch import Tensor
 
 from nbavatar.camera.distortion import distort_pixels
 
-__all__ = ["SilhouettePull", "Silhouettes", "choose_rim", "ideal_mask", "pull_to_silhouettes", "signed_distance_map"]
+__all__ = [
+    "FAR",
+    "SilhouettePull",
+    "Silhouettes",
+    "choose_rim",
+    "distance_map",
+    "ideal_mask",
+    "pull_to_silhouettes",
+    "signed_distance_map",
+]
 
+FAR = 1e6
+"""Distance to what is nowhere [px]."""
 _RIM = 0.2
 """Largest cosine between surface normal and line of sight on the rim."""
 
@@ -37,6 +49,7 @@ class Silhouettes:
         band: how far from the border a rim point may be drawn [px].
         deviation: typical distance of a correct contour from the border [px].
         weight: weight of one point, against one keypoint of confidence 1.
+        cover: distance to the nearest pixel that says nothing, likewise `[M, n, h, w]`; None where there is none.
         drawn: bool `[M, n, P]`, which points are drawn to the border; None before the choice (`choose_rim`).
     """
 
@@ -47,6 +60,7 @@ class Silhouettes:
     band: float
     deviation: float
     weight: float
+    cover: Tensor | None = None
     drawn: Tensor | None = None
 
 
@@ -99,6 +113,15 @@ def signed_distance_map(mask: np.ndarray, pixel: float) -> np.ndarray:
     return (pixel * np.where(mask, 0.5 - inside, outside - 0.5)).astype(np.float32)
 
 
+def distance_map(mask: np.ndarray, pixel: float) -> np.ndarray:
+    """Distance to the nearest true pixel of a mask bool `[h, w]`, float32 [px of the full image]; else `FAR`."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not mask.any():
+        return np.full(mask.shape, FAR, np.float32)
+    return (pixel * np.asarray(distance_transform_edt(~mask))).astype(np.float32)
+
+
 def choose_rim(masks: Silhouettes, pixels: Tensor, camera: Tensor, normals: Tensor) -> Silhouettes:
     """Chooses the points that are drawn to the border; kept for many steps, so that the cost stays continuous.
 
@@ -110,15 +133,19 @@ def choose_rim(masks: Silhouettes, pixels: Tensor, camera: Tensor, normals: Tens
     """
     if not masks.border:
         return masks
-    value, _ = _sample(masks, pixels)
+    value, _ = _sample(masks.distance, masks, pixels)
     sight = camera / camera.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     rim = (normals * sight).sum(-1).abs() < _RIM
-    return dataclasses.replace(masks, drawn=rim & (value.abs() < masks.band))
+    rim &= value.abs() < masks.band
+    if masks.cover is not None:  # the border nearest to a point is the cover's where no part of it is farther than that
+        away, _ = _sample(masks.cover, masks, pixels)
+        rim &= away > value.abs() + 1.0 / masks.scale[:, None, None]
+    return dataclasses.replace(masks, drawn=rim)
 
 
 def pull_to_silhouettes(masks: Silhouettes, pixels: Tensor, camera: Tensor) -> SilhouettePull:
     """Compares sample points `[M, n, P]` with the masks; arguments as in `choose_rim`."""
-    value, gradient = _sample(masks, pixels)
+    value, gradient = _sample(masks.distance, masks, pixels)
     outside = value > 0
     used = (outside if masks.drawn is None else masks.drawn | outside) & (camera[..., 2] > 1e-3)
     squared = value**2
@@ -129,16 +156,16 @@ def pull_to_silhouettes(masks: Silhouettes, pixels: Tensor, camera: Tensor) -> S
     return SilhouettePull(value, gradient, weight)
 
 
-def _sample(masks: Silhouettes, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Bilinear value `[M, n, P]` and gradient `[M, n, P, 2]` of the distance maps; zero outside of them."""
-    height, width = masks.distance.shape[2:]
+def _sample(maps: Tensor, masks: Silhouettes, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Bilinear value `[M, n, P]` and gradient `[M, n, P, 2]` of distance maps `[M, n, h, w]`; zero outside of them."""
+    height, width = maps.shape[2:]
     place = pixels * masks.scale[:, None, None, None] - 0.5
     x, y = place[..., 0], place[..., 1]
     known = (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
     x, y = x.clamp(0, width - 1.001), y.clamp(0, height - 1.001)
     column, row = x.floor().long(), y.floor().long()
     u, v = x - column, y - row
-    flat = masks.distance.flatten(2).double()
+    flat = maps.flatten(2).double()
     index = (row * width + column).reshape(*pixels.shape[:3])
     a, b, c, d = (flat.gather(2, index + offset) for offset in (0, 1, width, width + 1))
     value = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from nbavatar.fitting.handedness import judge_handedness
 from nbavatar.fitting.observe import error_table, explained, frame_errors, keypoint_cameras, observe
 from nbavatar.fitting.parts import HandPart, HeadPart, PartModel, State
 from nbavatar.fitting.refine import Observations, Prior, Step, refine
-from nbavatar.fitting.silhouette import Silhouettes, ideal_mask, signed_distance_map
+from nbavatar.fitting.silhouette import FAR, Silhouettes, distance_map, ideal_mask, signed_distance_map
 from nbavatar.fitting.start import start_from_keypoints, start_from_parameters, with_anchor, zero_state
 from nbavatar.fitting.triangulate import Triangulation
 
@@ -48,11 +48,13 @@ class Masks:
         frames: positions in the sequence, increasing.
         images: camera -> bool `[n, H, W]`, as recorded (distorted); cameras may be missing.
         labels: whether they show head and hands only, or (False) the whole person.
+        unseen: camera -> where they say nothing, likewise, and `images` is true; cameras may be missing.
     """
 
     frames: Sequence[int]
     images: Mapping[str, np.ndarray]
     labels: bool
+    unseen: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
 def fit_sequence(
@@ -118,7 +120,7 @@ def _fit_part(
     cfg: FitConfig,
     cameras: Sequence[str] | None,
     masks: Masks | None,
-    maps: Mapping[str, tuple[np.ndarray, float]],
+    maps: Mapping[str, "_Maps"],
     progress: Callable[[str, Step], None] | None,
 ) -> tuple[Part, dict[str, np.ndarray], dict[str, Any]]:
     used = [c for c in keypoint_cameras(extras, name) if cameras is None or c in cameras]
@@ -253,9 +255,9 @@ def _prior(
 
 def _distance_maps(
     masks: Masks | None, cameras: Sequence[str] | None, extras: Mapping[str, np.ndarray], cfg: FitConfig
-) -> dict[str, tuple[np.ndarray, float]]:
-    """Camera -> distance maps `[n, h, w]` and their scale; the same serve all parts."""
-    maps: dict[str, tuple[np.ndarray, float]] = {}
+) -> dict[str, "_Maps"]:
+    """Camera -> its maps; the same serve all parts."""
+    maps: dict[str, _Maps] = {}
     if masks is None or cfg.silhouette_weight == 0:
         return maps
     for camera, images in masks.images.items():
@@ -265,27 +267,43 @@ def _distance_maps(
                 distortion = None
             K = np.asarray(extras[f"camera.{camera}.K"], dtype=np.float64)
             reduced, scale = ideal_mask(images, K, distortion, cfg.silhouette_lines)
-            maps[camera] = np.stack([signed_distance_map(mask, 1 / scale) for mask in reduced]), scale
+            distance, cover = np.stack([signed_distance_map(mask, 1 / scale) for mask in reduced]), None
+            if camera in masks.unseen:
+                hidden, _ = ideal_mask(masks.unseen[camera], K, distortion, cfg.silhouette_lines)
+                cover = np.stack([distance_map(mask, 1 / scale) for mask in hidden])
+            maps[camera] = _Maps(distance, cover, scale)
     return maps
 
 
+class _Maps(NamedTuple):
+    """Of one camera: signed distances to the border, distances to what says nothing, `[n, h, w]`; their scale."""
+
+    distance: np.ndarray
+    cover: np.ndarray | None
+    scale: float
+
+
 def _silhouettes(
-    masks: Masks, maps: Mapping[str, tuple[np.ndarray, float]], cameras: Sequence[str], cfg: FitConfig, scale: float
+    masks: Masks, maps: Mapping[str, _Maps], cameras: Sequence[str], cfg: FitConfig, scale: float
 ) -> Silhouettes | None:
     """Distance maps of the cameras in use; None when there are none."""
     maps = {camera: maps[camera] for camera in cameras if camera in maps}
     if not maps:
         return None
-    height, width = (max(m.shape[axis] for m, _ in maps.values()) for axis in (1, 2))
+    height, width = (max(found.distance.shape[axis] for found in maps.values()) for axis in (1, 2))
     distance = np.zeros((len(cameras), len(masks.frames), height, width), dtype=np.float32)
+    cover = np.full_like(distance, FAR)
     scales = np.ones(len(cameras))
     for row, camera in enumerate(cameras):
         if camera in maps:
-            values, scales[row] = maps[camera]
-            distance[row, :, : values.shape[1], : values.shape[2]] = values
+            found = maps[camera]
+            scales[row], window = found.scale, np.s_[row, :, : found.distance.shape[1], : found.distance.shape[2]]
+            distance[window] = found.distance
+            cover[window] = FAR if found.cover is None else found.cover
     return Silhouettes(
         torch.tensor(list(masks.frames)), torch.from_numpy(distance), torch.from_numpy(scales), masks.labels,
         cfg.silhouette_band_px * scale, cfg.silhouette_deviation_px * scale, cfg.silhouette_weight,
+        torch.from_numpy(cover) if any(found.cover is not None for found in maps.values()) else None,
     )  # fmt: skip
 
 

@@ -182,14 +182,15 @@ def _indices(image: Image.Image) -> np.ndarray:
     """Values of a picture with a palette, uint8 `[H, W]`.
 
     Palettes of colours number labels, and the numbers count. A palette of greys may belong to a matte that was made
-    smaller: then the greys count, unless there are three or four that number 0..3.
+    smaller: then the greys count, unless there are three or four that number 0..3, beside 255 or not.
     """
     index = np.array(image)
     used = np.unique(index)
     palette = np.array(image.getpalette("RGB") or [], dtype=np.uint8).reshape(-1, 3)
     if len(used) and used.max() < len(palette):
         shown = palette[used].astype(int)
-        if (np.ptp(shown, axis=1) == 0).all() and (len(used) <= 2 or used.max() > 3):
+        numbers = used[used < 255]
+        if (np.ptp(shown, axis=1) == 0).all() and (len(numbers) <= 2 or numbers.max() > 3):
             return palette[index, 0]
     return index
 

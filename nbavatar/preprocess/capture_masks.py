@@ -1,7 +1,7 @@
 """Masks and alpha images of one camera of a capture: what they mean, and reading them."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from nbavatar.data.pictures import find_picture
 from nbavatar.errors import DataError
 from nbavatar.io.framepack import unseen_in
 from nbavatar.io.pictures import read_plane
-from nbavatar.preprocess.mask_values import Meaning, ValueSurvey, spread
+from nbavatar.preprocess.mask_values import HANDS, Meaning, ValueSurvey, labels_in, spread
 
 __all__ = ["CameraMasks", "open_masks"]
 
@@ -68,8 +68,10 @@ def open_masks(capture: Capture, camera: Camera, frames: Sequence[str]) -> Camer
     masks, alpha = (_survey(capture, camera, kind, frames) for kind in ("masks", "alpha"))
     meaning = None
     if masks is not None:
-        parts = list(read_topology(capture.root)) if masks.largest == 1 else []
-        meaning = masks.masks(capture.root / "masks" / camera.name, parts, _elsewhere(capture, camera))
+        parts: Sequence[str] = ()
+        if masks.largest == 1 and not _labelled_elsewhere(capture, camera):
+            parts = list(read_topology(capture.root))
+        meaning = masks.masks(capture.root / "masks" / camera.name, parts)
     coverage = None if alpha is None else alpha.coverage(capture.root / "alpha" / camera.name)
     opened = CameraMasks(capture.root, camera, meaning, coverage)
     if meaning is not None and coverage is not None:
@@ -119,10 +121,13 @@ def _picture(root: Path, kind: str, camera: str, frame: str) -> Path:
     return path
 
 
-def _elsewhere(capture: Capture, camera: Camera) -> Iterator[np.ndarray]:
-    """Masks of the other cameras, in some of the frames."""
+def _labelled_elsewhere(capture: Capture, camera: Camera) -> bool:
+    """Whether another camera's masks hold the labels of hands, in some of the frames: this one may just not see any."""
     for frame in spread(read_splits(capture.root).frames):
         for other in capture.cameras.values():
             path = find_picture(capture.root / "masks" / other.name, frame)
             if other.name != camera.name and path is not None:
-                yield read_plane(path, (other.width, other.height)).values
+                values = read_plane(path, (other.width, other.height)).values
+                if labels_in(values) & HANDS:
+                    return True
+    return False

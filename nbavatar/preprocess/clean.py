@@ -3,6 +3,8 @@
 import cv2
 import numpy as np
 
+from nbavatar.io.framepack import unseen_in
+
 __all__ = ["clean_labels", "repair_flicker", "spread_labels", "threshold_matte"]
 
 
@@ -22,10 +24,10 @@ def clean_labels(label: np.ndarray, support: np.ndarray, *, hole_fraction: float
     than `hole_fraction` of all parts together and lies mostly within the meshes' silhouettes: gaps between fingers or
     strands are real, holes in a cheek are not. An island is a piece of a part that is not its largest; it is removed
     if it is smaller than `island_fraction` of the part, unless it lies mostly within the part's own silhouette (a
-    fingertip that is seen beyond another finger).
+    fingertip that is seen beyond another finger) or touches pixels that say nothing, behind which it may go on.
 
     Args:
-        label: uint8 `[H, W]`, 0 = background.
+        label: uint8 `[H, W]`, 0 = background, 255 = says nothing, which stays so.
         support: uint8 `[H, W]`, labels of the projected meshes.
         hole_fraction: share of the area of all parts.
         island_fraction: share of the area of the part.
@@ -34,8 +36,10 @@ def clean_labels(label: np.ndarray, support: np.ndarray, *, hole_fraction: float
         uint8 `[H, W]`, a new array.
     """
     result = label.copy()
-    total = int((label > 0).sum())
-    for value in np.unique(label[label > 0]):
+    unseen = unseen_in(label)
+    total = int(((label > 0) & ~unseen).sum())
+    beside = cv2.dilate(unseen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 if unseen.any() else unseen
+    for value in np.unique(label[(label > 0) & ~unseen]):
         count, pieces, stats, _ = cv2.connectedComponentsWithStats((label == value).astype(np.uint8), connectivity=8)
         if count <= 2:
             continue
@@ -44,6 +48,7 @@ def clean_labels(label: np.ndarray, support: np.ndarray, *, hole_fraction: float
         own = np.bincount(pieces[support == value], minlength=count)
         drop = (areas < island_fraction * areas.sum()) & (2 * own < areas)
         drop[[0, int(areas.argmax())]] = False
+        drop[pieces[beside]] = False
         result[drop[pieces]] = 0
     count, pieces, stats, _ = cv2.connectedComponentsWithStats((result == 0).astype(np.uint8), connectivity=4)
     height, width = label.shape
@@ -57,7 +62,8 @@ def clean_labels(label: np.ndarray, support: np.ndarray, *, hole_fraction: float
     holes = fill[pieces]
     if not holes.any():
         return result
-    return np.where(holes, np.where(support > 0, support, spread_labels(result)), result)
+    nearest = spread_labels(np.where(unseen, np.uint8(0), result))
+    return np.where(holes, np.where(support > 0, support, nearest), result)
 
 
 def repair_flicker(before: np.ndarray, label: np.ndarray, after: np.ndarray, support: np.ndarray) -> np.ndarray:

@@ -80,11 +80,10 @@ def resize_area(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def resize_unseen(unseen: np.ndarray, size: int) -> np.ndarray:
-    """Resizes a mask of pixels that say nothing, bool `[S, S]`: a smaller pixel with a part of one says nothing."""
+    """Resizes a mask of pixels that say nothing, bool `[S, S]`: of a pixel that has a part of one nothing is known."""
     if unseen.shape[0] == size or not unseen.any():
         return unseen if unseen.shape[0] == size else np.zeros((size, size), bool)
-    share = resize_area(np.where(unseen, np.uint8(255), np.uint8(0)), size)
-    return share > (0 if size < unseen.shape[0] else 127)
+    return resize_area(np.where(unseen, np.uint8(255), np.uint8(0)), size) > 0
 
 
 def resize_labels(label: np.ndarray, alpha: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -12,8 +12,7 @@ labels that a lossy format has blurred.
 """
 
 import dataclasses
-import itertools
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 
 import cv2
 import numpy as np
@@ -21,10 +20,13 @@ import numpy as np
 from nbavatar.errors import DataError
 from nbavatar.io.framepack import UNSEEN
 
-__all__ = ["LABELS", "Meaning", "ValueSurvey", "labels_in", "spread"]
+__all__ = ["HANDS", "LABELS", "Meaning", "ValueSurvey", "labels_in", "spread"]
 
 LABELS = 3
 """Largest label of a part."""
+
+HANDS = frozenset({2, 3})
+"""Labels of hands."""
 
 _END = 1 / 8  # share of the matte's range that counts as an end
 # Most of the foreground that may lie flat between the ends, and that may lie there at all: in masks of few values and
@@ -33,6 +35,7 @@ _FEW_VALUES, _MANY_VALUES, _COVERAGE = (0.002, 0.6), (0.05, 0.6), (0.5, 1.0)
 _FEW = 32
 _SOFT = 32  # a matte of more than two values has more than so many levels
 _FULL = 0.75  # a matte whose foreground is above this share of its format's range is not scaled
+_STRAY = 1e-4  # least share of labels 1..3 in the foreground, the rest of which is 255
 _PATCH = 0.002  # share of a picture that is flat and holds labels, when the other pictures are mattes
 _FIX = (
     "store 0 background, 1 head, 2 right hand, 3 left hand, 255 something else in front, as png; or 0 and 255 for the "
@@ -45,7 +48,7 @@ class Meaning:
     """How a camera's masks are read.
 
     Attributes:
-        kind: `label` (0..3) or `person` (a matte of the whole person).
+        kind: `label` (0..3, and 255 if `unseen`) or `person` (a matte of the whole person).
         white: stored value of a matte that stands for full coverage; 0 for labels.
         unseen: whether labels of 255 are among the masks: pixels that say nothing.
     """
@@ -125,34 +128,24 @@ class ValueSurvey:
         spread = cv2.dilate(values, kernel).astype(np.int32) - cv2.erode(values, kernel)
         flat = np.bincount(values[spread <= top // 32])
         self._flat[: len(flat)] += flat
-        labelled = flat[1 : LABELS + 1].sum() > _PATCH * values.size
         if top > LABELS:
             self._above += 1
-            self._unseen |= bool(labelled and self._labels_alone(counts))
-        elif labelled:
+            self._unseen |= bool(counts[1 : LABELS + 1].any() and self._labels_alone(counts))
+        elif flat[1 : LABELS + 1].sum() > _PATCH * values.size:
             self._labelled.append(name)
 
-    def masks(self, where: object, parts: Collection[str], others: Iterable[np.ndarray] = ()) -> Meaning:
+    def masks(self, where: object, parts: Collection[str]) -> Meaning:
         """Meaning of masks.
 
         Args:
             where: folder or video, for error lines.
             parts: parts that have a mesh. Masks of 0 and 1 alone are labels where there is a head only, and mattes of
                 the whole person where anything else has a mesh.
-            others: pictures of other cameras, asked where this camera's own leave it open: 0 and 1 are labels too where
-                others hold the label of a hand, which this camera may just not see; 0 and 255 are where others hold 255
-                beside labels.
 
         Raises:
             DataError: neither labels nor a matte, or both.
         """
         top = self.largest
-        if top == UNSEEN and self._counts.nonzero()[0].tolist() == [0, UNSEEN]:
-            # Hard mattes are many and large, and labels that say nothing are in most pictures, if in any: a few tell.
-            if any({UNSEEN} < labels_in(values) for values in itertools.islice(others, _FEW)):
-                return Meaning("label", 0, unseen=True)
-        elif top == 1 and any(max(labels_in(values) - {UNSEEN}, default=0) > 1 for values in others):
-            parts = ()
         if top <= LABELS:
             if self._lossy and top > 0:
                 if not self._labelled:  # a matte that shows nobody, and the noise of its format
@@ -162,7 +155,7 @@ class ValueSurvey:
                 raise DataError.of(where, "values", expected=f"labels 0..{LABELS} or 0..255", found=found, fix=fix)
             meaning = Meaning("person", 1) if top == 1 and set(parts) - {"head"} else Meaning("label", 0)
             return self._with_background(meaning, where)
-        if self._unseen and not self._lossy and self._labels_alone(self._counts):
+        if self._unseen and not self._lossy and self._labels_alone(self._counts) and self._parts_show():
             return self._with_background(Meaning("label", 0, unseen=True), where)
         if self._labelled and not self._lossy:
             found = f"{self._above} of {self._pictures} masks with values above 3, and labels in {self._labelled[0]}"
@@ -195,6 +188,10 @@ class ValueSurvey:
         """Whether all values that are there are labels, or that of pixels that say nothing."""
         there = counts.nonzero()[0]
         return bool(((there <= LABELS) | (there == UNSEEN)).all())
+
+    def _parts_show(self) -> bool:
+        """Whether labels of parts are more than strays: a hard matte may have a pixel of another value."""
+        return bool(self._flat[1 : LABELS + 1].sum() > _STRAY * self._counts[1:].sum())
 
     def _few(self) -> bool:
         return not self._lossy and int((self._counts > 0).sum()) <= _FEW

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import cv2
 import numpy as np
 
-from nbavatar.io.framepack import mark_unseen, unseen_in
+from nbavatar.io.framepack import UNSEEN, mark_unseen, unseen_in
 from nbavatar.preprocess.clean import clean_labels, repair_flicker
 from nbavatar.preprocess.clothes import ClothesModel
 from nbavatar.preprocess.part_masks import PartCutter
@@ -47,7 +47,6 @@ class _Frame:
     coverage: np.ndarray | None
     label: np.ndarray
     support: np.ndarray
-    unseen: np.ndarray
 
 
 def cut_masks(
@@ -105,7 +104,6 @@ def _prepare(
     clothes: ClothesModel | None,
 ) -> _Frame:
     outlines = cutter.silhouettes(name)
-    unseen = np.zeros(mask.shape, bool)
     if matte:
         label = cutter.cut(mask, outlines, numbers.threshold)
         if images is not None and clothes is not None:
@@ -118,17 +116,15 @@ def _prepare(
         other = (mask > numbers.threshold) & (label == 0)
         statistics.dropped += int(other.sum())
         if numbers.covered == "unknown":
-            unseen = other & outlines.meshes
+            label[other & outlines.meshes] = UNSEEN
     else:
-        unseen = unseen_in(mask)
-        label = np.where(unseen, np.uint8(0), mask)
+        label = mask
     cleaned = clean_labels(
         label, outlines.support, hole_fraction=numbers.hole_fraction, island_fraction=numbers.island_fraction
     )
-    cleaned = np.where(unseen, np.uint8(0), cleaned)  # a hole that is covered is none
     statistics.removed += int(((label > 0) & (cleaned == 0)).sum())
     statistics.filled += int(((label == 0) & (cleaned > 0)).sum())
-    return _Frame(name, mask, coverage, cleaned, outlines.support, unseen)
+    return _Frame(name, mask, coverage, cleaned, outlines.support)
 
 
 def _finish(
@@ -146,21 +142,23 @@ def _finish(
         if run_of.get(before.name) == run_of.get(now.name) == run_of.get(after.name):
             label = repair_flicker(before.label, now.label, after.label, now.support)
             statistics.flicker += int((label != now.label).sum())
+    unseen = unseen_in(label)
+    part = (label > 0) & ~unseen
     if now.coverage is not None:
-        alpha = np.where(label > 0, now.coverage, np.uint8(0))
+        alpha = np.where(part, now.coverage, np.uint8(0))
     else:
-        alpha = np.where(label > 0, np.uint8(255), np.uint8(0))
+        alpha = np.where(part, np.uint8(255), np.uint8(0))
         if numbers.soft_alpha and matte:
             alpha = _soften(alpha, now.mask)
     label = np.where(alpha > 0, label, np.uint8(0))
-    statistics.labelled += int((label > 0).sum())
-    if not label.any():
-        statistics.empty_frames.append(now.name)
-    unseen = now.unseen & (label == 0)
     if unseen.any():  # what is half a part and half its cover has neither's colour, and is no edge of the part
         unseen |= (cv2.dilate(unseen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & (label > 0) & (alpha < 255)
-    statistics.unseen += int(unseen.sum())
     mark_unseen(label, alpha, unseen)
+    statistics.unseen += int(unseen.sum())
+    labelled = int((alpha > 0).sum())
+    statistics.labelled += labelled
+    if not labelled:
+        statistics.empty_frames.append(now.name)
     return now.name, label, alpha
 
 

@@ -113,12 +113,13 @@ def frame_masks(masks: CameraMasks, frame: str) -> dict[str, np.ndarray]:
 
 
 def _agree(label: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels spread to all covered pixels; labels where nothing is covered are dropped. What says nothing stays so."""
-    unseen = unseen_in(label)
-    label = np.where((alpha > 0) & ~unseen, label, np.uint8(0))
-    orphan = (alpha > 0) & (label == 0) & ~unseen
+    """Labels spread to all covered pixels, that of pixels that say nothing too (the soft edge of a garment is the
+    garment's); labels of parts where nothing is covered are dropped.
+    """
+    label = np.where((alpha > 0) | unseen_in(label), label, np.uint8(0))
+    orphan = (alpha > 0) & (label == 0)
     if orphan.any():
         label = np.where(orphan, spread_labels(label), label)
     alpha = np.where(label > 0, alpha, np.uint8(0))
-    mark_unseen(label, alpha, unseen)
+    mark_unseen(label, alpha, unseen_in(label))
     return label, alpha

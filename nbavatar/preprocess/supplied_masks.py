@@ -11,13 +11,18 @@ from nbavatar.data.pictures import find_picture, list_pictures
 from nbavatar.errors import DataError
 from nbavatar.io.pictures import Plane, read_plane
 from nbavatar.io.video import probe_video, read_video
-from nbavatar.preprocess.mask_values import Meaning, ValueSurvey, spread
+from nbavatar.preprocess.mask_values import HANDS, Meaning, ValueSurvey, labels_in, spread
 
 __all__ = ["supplied_masks"]
 
 
 def supplied_masks(
-    folder: str | Path, subject: str, camera: Camera, frames: Sequence[str], parts: Sequence[str]
+    folder: str | Path,
+    subject: str,
+    camera: Camera,
+    frames: Sequence[str],
+    parts: Sequence[str],
+    known: Meaning | None = None,
 ) -> tuple[Iterator[np.ndarray], Meaning]:
     """Masks of one camera, and what they mean (see `mask_values`): one uint8 `[H, W]` a frame, in order.
 
@@ -32,6 +37,8 @@ def supplied_masks(
         camera: its size is the masks' size.
         frames: ids.
         parts: parts that have a mesh.
+        known: what this camera's masks mean, where all of them have been looked at before; a few frames alone may not
+            tell.
 
     Raises:
         DataError: nothing there, a frame without a mask, another size, a video that is too short, or values that mean
@@ -39,10 +46,14 @@ def supplied_masks(
     """
     place = _find(Path(folder), subject, camera.name)
     read = _from_images if place.is_dir() else _from_video
+    if known is not None:
+        return (known.read(plane.values, path) for path, plane in read(place, frames, camera)), known
     survey = ValueSurvey()
     for path, plane in read(place, frames, camera):
         survey.add(plane.values, plane.lossy, path.name)
-    meaning = survey.masks(place, parts, _beside(place) if place.is_dir() else ())
+    if survey.largest == 1 and place.is_dir() and _labelled_beside(place):
+        parts = ()
+    meaning = survey.masks(place, parts)
     return (meaning.read(plane.values, path) for path, plane in read(place, frames, camera)), meaning
 
 
@@ -80,11 +91,12 @@ def _from_video(path: Path, frames: Sequence[str], camera: Camera) -> Iterator[t
         raise DataError.of(path, "frames", expected=f"frame {frames[found]}", found="a video that ends before it")
 
 
-def _beside(folder: Path) -> Iterator[np.ndarray]:
-    """Masks of the other cameras, in some of the frames."""
+def _labelled_beside(folder: Path) -> bool:
+    """Whether another camera's images hold the labels of hands, in some frames: this one may just not see any."""
     for other in sorted(folder.parent.iterdir()):
         if other.is_dir() and other != folder:
             for name in spread(list(list_pictures(other))):
                 path = find_picture(other, name)
-                if path is not None:
-                    yield read_plane(path).values
+                if path is not None and labels_in(read_plane(path).values) & HANDS:
+                    return True
+    return False

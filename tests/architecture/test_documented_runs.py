@@ -193,7 +193,7 @@ def project(tmp_path_factory):
 def planned(words: list[str], where: Path) -> str:
     """Output of the plan that words of snakemake or of `nbavatar run` make."""
     if words[0] == "nbavatar":
-        words = [sys.executable, "-m", *words, "--", "-n"]
+        words = [sys.executable, "-m", *words, *(() if "--" in words else ("--",)), "-n"]
         done = subprocess.run(words, cwd=where, env=ENVIRONMENT, capture_output=True, text=True)
     else:
         configured = [] if "--configfile" in words else ["--configfile", "config/smoke.yaml"]  # the paper needs Decaf

@@ -102,7 +102,7 @@ def step_loss(
     target = target_in(window, sample)
     truth = target.colour + (1.0 - target.alpha) * background[:, None, None]
     image = compose(window.colour, window.alpha, background)
-    # Pixels of parts that are in the picture but not in the model say nothing about the model.
+    # Pixels of parts that are not in the model, that are covered, or beyond the picture say nothing about the model.
     image = torch.lerp(image, truth, target.ignored)
     nb_alpha = torch.lerp(window.nb_alpha, target.alpha, target.ignored)
 

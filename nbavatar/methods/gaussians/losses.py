@@ -47,7 +47,8 @@ def compare(colour: Tensor, alpha: Tensor, sample: Sample, background: Tensor) -
 
     Args:
         colour: premultiplied, (3, H, W); alpha: (H, W).
-        sample: the truth. Pixels of parts that are in the picture but not in the model are taken from it for both.
+        sample: the truth. Pixels that say nothing (of parts that are not in the model, covered, or outside the picture)
+            are taken from it for both.
         background: RGB (3,).
     """
     height, width = alpha.shape

@@ -92,8 +92,8 @@ def prepare_shots(
         sequence: meshes of the frames.
         parts: parts of the avatar.
         views: cameras and frames.
-        truths: colours uint8 (H, W, 3) and coverage uint8 (H, W) of each view, and the pixels that its camera did not
-            see, bool (H, W), if there are any.
+        truths: colours uint8 (H, W, 3) and coverage uint8 (H, W) of each view, and the pixels that say
+            nothing, bool (H, W), if there are any.
         background: sRGB in [0, 1].
         net: LPIPS on `device`.
         refined: whether training frames use their refinement.

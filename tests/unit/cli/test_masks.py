@@ -42,6 +42,32 @@ def test_a_matte_is_cut_into_the_labels_it_was_made_from(prepared, capture_maste
         assert pack.manifest["record"]["pixels"]["labelled"] > 0
 
 
+@pytest.mark.parametrize("covered", ["background", "unknown"])
+def test_what_hides_a_mesh_is_background_or_unknown(prepared, covered):
+    """The hand's open wrist shows its inside, which counts as forearm: with a sleeve it hides the hand's mesh."""
+    assert masks(prepared, covered=covered) == 0
+    with FramePack(prepared / "m.zip") as pack:
+        unseen = sum(int((pack.read("label", frame) == 255).sum()) for frame in pack.frames)
+        assert pack.manifest["record"]["pixels"]["unseen"] == unseen
+        assert pack.manifest["unseen"] == (unseen > 0) == (covered == "unknown")
+
+
+def test_labels_that_say_nothing_go_through_ingest_and_masks(capture, tmp_path):
+    for path in capture.glob("masks/*/*.png"):
+        label = np.array(Image.open(path))
+        label[40:44, 40:48] = 255
+        Image.fromarray(label).save(path)
+    common = ["--layout", "capture", "--root", str(capture), "--subject", "me"]
+    assert main(["ingest", *common, "--camera", "left", "--out", str(tmp_path / "left.zip")]) == 0
+    assert main(["tracks", *common, "--out", str(tmp_path / "t.npz")]) == 0
+    assert masks(tmp_path) == 0
+    for name in ("left.zip", "m.zip"):
+        with FramePack(tmp_path / name) as pack:
+            for frame in pack.frames:
+                assert (pack.unseen(frame)[40:44, 40:48]).all() and pack.unseen(frame).sum() == 32
+                assert not pack.read("alpha", frame)[40:44, 40:48].any()
+
+
 @pytest.mark.parametrize("layout", ["me/left/{}.png", "left/{}.png"])
 def test_masks_of_one_s_own_by_image(prepared, capture_master, layout):
     for i in range(5):

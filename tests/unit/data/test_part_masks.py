@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.sequences import MeshSequence, Part
 from nbavatar.mesh.zbuffer import rasterize_mesh
+from nbavatar.preprocess.clothes import ClothesModel
 from nbavatar.preprocess.masking import MaskNumbers, MaskStatistics, cut_masks
 from nbavatar.preprocess.part_masks import Margins, PartCutter
 
@@ -129,22 +130,40 @@ def behind(sequence, camera, row, *parts):
     return shown
 
 
-def test_what_hides_a_mesh_may_say_nothing(scene):
-    """The forearm in front of the head, cloth over the lower head: known from the meshes and the true labels."""
-    sequence, camera, mattes, _ = scene
+def test_what_hides_a_mesh_may_say_nothing(scene, rng):
+    """Forearm and collar in front of the head: where they are is known from the true labels and the meshes alone."""
+    sequence, camera, mattes, truth = scene
+    truth = [label.copy() for label in truth]
+    for label in truth:  # a collar, twelve rows high
+        rows = np.flatnonzero((label == 1).any(1))
+        label[rows.max() - 11 : rows.max() + 1][label[rows.max() - 11 : rows.max() + 1] == 1] = 0
+    skin, cloth = np.array([200.0, 160, 130]), np.array([150.0, 40, 50])
+    pictures = {
+        frame: (np.where(label[..., None] > 0, skin, cloth) + rng.normal(0, 4, (HEIGHT, WIDTH, 3))).astype(np.uint8)
+        for frame, label in zip(sequence.frames, truth)
+    }
+    statistics, numbers = MaskStatistics(), dataclasses.replace(NUMBERS, covered="unknown", temporal=False)
+    source = ((frame, matte, None) for frame, matte in zip(sequence.frames, mattes))
     cutter = PartCutter(sequence, camera, MARGINS)
-    plain, _ = cut(scene, mattes)
-    found, statistics = cut(scene, mattes, numbers=dataclasses.replace(NUMBERS, covered="unknown"))
-    total, sleeve = 0, 0
-    for row, ((frame, before, _), (_, label, alpha)) in enumerate(zip(plain, found)):
+    result = list(
+        cut_masks(
+            source, cutter, [sequence.frames], numbers, statistics, matte=True, images=pictures.__getitem__,
+            clothes=ClothesModel(1.0),
+        )
+    )  # fmt: skip
+    scores, total, sleeve = [], 0, 0
+    for row, (frame, label, alpha) in enumerate(result):
+        wanted = behind(sequence, camera, row, "head", "right_hand") & (truth[row] == 0) & (mattes[row] > 0)
         unseen = label == 255
-        sleeve += int((unseen & (cutter.silhouettes(frame).support == 0)).sum())
-        np.testing.assert_array_equal(np.where(unseen, 0, label), before)
-        np.testing.assert_array_equal(alpha > 0, np.isin(label, (1, 2)))
-        wanted = behind(sequence, camera, row, "head", "right_hand") & (before == 0) & (mattes[row] > 0)
-        np.testing.assert_array_equal(unseen, wanted)
+        scores.append(iou(unseen, wanted))
         total += int(unseen.sum())
-    assert statistics.unseen == total > 200 and sleeve > 100, (total, sleeve)
+        sleeve += int((unseen & (cutter.silhouettes(frame).support == 0)).sum())
+        np.testing.assert_array_equal(alpha > 0, np.isin(label, (1, 2)))
+    # The colours of cloth are averaged over three pixels, and the sleeve is a cone where the arm is a tube.
+    assert min(scores) > 0.8, scores
+    assert statistics.unseen == total and statistics.clothes > 200 and sleeve > 100, (total, statistics.clothes, sleeve)
+    plain, _ = cut(scene, mattes)
+    assert not any((label == 255).any() for _, label, _ in plain)
 
 
 def test_labels_that_say_nothing_are_kept_and_take_half_covered_neighbours_with_them(scene):

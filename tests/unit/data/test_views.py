@@ -71,6 +71,21 @@ def test_sample_marks_what_the_camera_did_not_see(packs, tmp_path) -> None:
     assert before[3][:, 20:].any() and not picture[3][:, 20:].any()
 
 
+def test_of_a_small_pixel_with_a_part_that_says_nothing_nothing_is_known(packs, tmp_path) -> None:
+    """A neck of which a collar covers an odd number of rows: averaged, it would teach a neck half transparent."""
+    pack = packs[0]
+    with FramePackWriter(tmp_path / "out.zip", {**pack.manifest, "unseen": True}) as out:
+        for frame in pack.frames:
+            label, alpha = np.ones((SIZE, SIZE), np.uint8), np.full((SIZE, SIZE), 255, np.uint8)
+            label[SIZE - 5 :], alpha[SIZE - 5 :] = 255, 0
+            for layer, image in (("rgb", pack.read("rgb", frame)), ("label", label), ("alpha", alpha)):
+                out.add(layer, frame, image)
+    with FramePack(tmp_path / "out.zip") as cut:
+        small = _picture(ViewStore([cut], _views([cut]), PARTS, 10**9).sample(0, 4))
+    assert (small[4, -2:] == 1).all() and not small[:4, -2:].any()
+    assert not small[4, :-2].any() and (small[3, :-2] == 1).all()
+
+
 def test_sample_marks_parts_that_are_not_modelled(packs) -> None:
     picture = _picture(ViewStore(packs, _views(packs), ["head"], 10**9).sample(0))
     hand = packs[0].read("label", "f0") == 2

@@ -16,7 +16,7 @@ from nbavatar.detection.correspondence import (
 )
 from nbavatar.detection.hands import Hand, distinct, square_of_joints
 from nbavatar.detection.squares import Square, cut_square, square_around, to_crop, to_image
-from nbavatar.detection.stage import keep_parts
+from nbavatar.detection.stage import _lies_on, keep_parts
 from nbavatar.detection.visibility import facing
 from nbavatar.detection.windows import frame_windows, mask_window
 from nbavatar.errors import DataError
@@ -168,6 +168,16 @@ def test_doubles_of_a_hand_are_dropped():
     joints = np.random.default_rng(6).uniform(0, 100, (21, 3))
     first, double, other = Hand(joints, 0.9, 1.0), Hand(joints + 3, 0.95, 0.0), Hand(joints + 80, 0.6, 0.0)
     assert distinct([first, double, other]) == [first, other]
+
+
+def test_a_hand_under_a_cover_lies_on_the_mask_as_far_as_it_is_known():
+    joints = np.stack([np.arange(21) * 2.0 + 0.5, np.full(21, 5.5), np.zeros(21)], 1)
+    hand, mask = Hand(joints, 0.9, 1.0), np.zeros((10, 60), np.uint8)
+    mask[:, 30:] = 2
+    assert not _lies_on(hand, mask, labels=True), "six of 21 joints on a hand"
+    mask[:, :30] = 255
+    assert _lies_on(hand, mask, labels=True), "six of the six that are known"
+    assert not _lies_on(hand, np.full_like(mask, 255), labels=True)
 
 
 def test_parts_that_no_two_cameras_see_are_left_out():

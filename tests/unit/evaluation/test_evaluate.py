@@ -268,10 +268,47 @@ def test_bad_input_is_one_line_exit_2_and_no_output(files, capsys, pictures, pro
 def test_mean_images_are_weighted_by_frames_not_by_cameras():
     ones, zeros = np.full((4, 4, 3), 255, np.uint8), np.zeros((4, 4, 3), np.uint8)
     full = np.full((4, 4), 255, np.uint8)
-    means = mean_images([("a", ones, full), ("a", ones, full), ("b", zeros, full)], (0, 0, 0))
+    means = mean_images([("a", ones, full, None), ("a", ones, full, None), ("b", zeros, full, None)], (0, 0, 0))
     assert means["a"].max() == 1 and means["b"].max() == 0
     np.testing.assert_allclose(means[""], 2 / 3, rtol=1e-6)
     assert mean_images([], (1, 1, 1)) == {}
+
+
+def test_mean_images_are_of_what_is_known():
+    ones, zeros = np.full((4, 4, 3), 255, np.uint8), np.zeros((4, 4, 3), np.uint8)
+    full, left = np.full((4, 4), 255, np.uint8), np.tile(np.arange(4) < 2, (4, 1))
+    corner = np.zeros((4, 4), bool)
+    corner[0, 0] = True
+    images = [("a", ones, full, left), ("a", zeros, full, corner)]
+    (means,) = {mean_images(images, (0.5, 0.5, 0.5))[key].tobytes() for key in ("a", "")}
+    found = np.frombuffer(means, np.float32).reshape(4, 4, 3)
+    expected = np.where(left, 0.0, 0.5)
+    expected[0, 0] = 0.5  # known in neither: the background
+    np.testing.assert_array_equal(found, np.repeat(expected[..., None], 3, -1).astype(np.float32))
+
+
+def test_the_mean_image_is_judged_where_the_truth_is_known(files):
+    """A mean that is right where anything is known is as right as an answer can be."""
+    for name in ("102", "train"):
+        manifest = _manifest(files, name)
+        with FramePackWriter(files / f"{name}.zip", manifest) as out:
+            for n, frame in enumerate(manifest["frames"]):
+                label, alpha = np.ones((SIZE, SIZE), np.uint8), alpha_of(3).copy()
+                columns = slice(4 * n, 4 * n + 9)
+                label[:, columns], alpha[:, columns] = 255, 0
+                for layer, plane in (("rgb", image(3)), ("label", label), ("alpha", alpha)):
+                    out.add(layer, frame, plane)
+    write_render(files / "render.zip", {"102/0001": image(1), "102/0002": image(1)})
+    extra = (*FAST, "--train-frames", str(files / "train.zip"))
+    assert run(files, files / "render.zip", extra=extra) == 0
+    assert json.loads((files / "eval.json").read_text())["trivial"]["mean_image"]["psnr"] > 60
+
+
+def _manifest(files, name):
+    """Of a crop with labels in which something says nothing."""
+    write_crop(files / f"{name}.zip", name, 3, unseen=slice(0, 1))
+    with FramePack(files / f"{name}.zip") as pack:
+        return pack.manifest
 
 
 def _without_anybody(path, frames):

@@ -1,5 +1,6 @@
 """What a change of protocol does to figures, on images where the answer is known."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -22,6 +23,17 @@ def images() -> Images:
 
 def psnr(pair) -> float:
     return -10 * math.log10(((pair[0].astype(np.float64) - pair[1]) ** 2).mean())
+
+
+def test_a_grown_mask_stays_out_of_what_is_not_known(images):
+    unseen = np.zeros((SIZE, SIZE), bool)
+    unseen[:, 60:] = True  # beside the square, which grows to the other sides
+    known = dataclasses.replace(images, unseen=unseen)
+    x, y = apply_setting(Setting(mask="grown"), known, (1, 1, 1), None)
+    free = apply_setting(Setting(mask="grown"), images, (1, 1, 1), None)[1]
+    np.testing.assert_array_equal(y[:, 60:], x[:, 60:])
+    np.testing.assert_array_equal(y[:, :60], free[:, :60])
+    assert (free[:, 60:] < 1).any()
 
 
 def test_base_is_the_stored_image(images):

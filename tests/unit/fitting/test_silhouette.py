@@ -1,12 +1,21 @@
 """Silhouette term: distance maps against analytic ones, derivatives, and what masks add to keypoints."""
 
+import dataclasses
+
 import numpy as np
 import torch
 
 from nbavatar.camera.distortion import distort_pixels
 from nbavatar.config.geometry import FitConfig
 from nbavatar.fitting.parts import HeadPart, retract
-from nbavatar.fitting.silhouette import Silhouettes, choose_rim, ideal_mask, pull_to_silhouettes, signed_distance_map
+from nbavatar.fitting.silhouette import (
+    Silhouettes,
+    choose_rim,
+    distance_map,
+    ideal_mask,
+    pull_to_silhouettes,
+    signed_distance_map,
+)
 from nbavatar.fitting.stage import Masks, fit_sequence
 from nbavatar.mesh.zbuffer import rasterize_mesh
 
@@ -75,6 +84,26 @@ def test_rim_points_near_the_border_are_chosen():
     normals = torch.tensor([[[[1.0, 0, 0], [1, 0, 0], [0, 0, -1], [1, 0, 0]]]]).double()
     assert choose_rim(masks, pixels, camera, normals).drawn[0, 0].tolist() == [True, False, False, False]
     assert choose_rim(_masks(masks.distance[0, 0].numpy(), border=False), pixels, camera, normals).drawn is None
+
+
+def test_rim_points_at_the_border_of_a_cover_are_kept_from_outside_only():
+    """A neck, columns 20 to 40, goes on behind a collar that is wider and ends at row 60."""
+    part, cover = np.zeros((80, 64), bool), np.zeros((80, 64), bool)
+    part[:40, 20:40], cover[40:60, 12:48] = True, True
+    distance = signed_distance_map(part | cover, 1.0)
+    masks = _masks(distance)
+    away = torch.from_numpy(distance_map(cover, 1.0))[None, None]
+    pixels = torch.tensor(
+        [[21.0, 10.0], [39.0, 20.0], [17.0, 20.0], [13.0, 50.0], [9.0, 50.0], [21.0, 50.0], [30.0, 58.0]]
+    )
+    pixels = pixels.double()[None, None]
+    camera = torch.tensor([0.0, 0.0, 1.0]).double().expand(1, 1, 7, 3)
+    normals = torch.tensor([1.0, 0.0, 0.0]).double().expand(1, 1, 7, 3)
+    assert choose_rim(masks, pixels, camera, normals).drawn.all()
+    covered = choose_rim(dataclasses.replace(masks, cover=away), pixels, camera, normals)
+    assert covered.drawn[0, 0].tolist() == [True, True, True, False, False, False, False]
+    weights = pull_to_silhouettes(covered, pixels, camera).weight[0, 0]
+    assert (weights > 0).tolist() == [True, True, True, False, True, False, False], "outside is outside"
 
 
 def test_surface_derivatives_equal_autograd():

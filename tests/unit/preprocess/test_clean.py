@@ -57,6 +57,22 @@ def test_islands_are_removed_unless_their_mesh_is_there():
     assert not clean_labels(label, support, **OPTIONS).any()
 
 
+def test_what_says_nothing_is_no_hole_and_cuts_nothing_off():
+    """A tuft of hair beyond a headband, and a microphone in front of a mouth."""
+    label = np.zeros((80, 80), np.uint8)
+    label[20:70, 20:60] = 1
+    label[15:20, 20:60] = 255
+    label[8:15, 35:42] = 1
+    label[50:53, 40:43] = 255
+    support = np.where(label == 1, 1, 0).astype(np.uint8)
+    support[:20] = 0
+    support[50:53, 40:43] = 1
+    found = clean_labels(label, support, hole_fraction=0.01, island_fraction=0.05)
+    np.testing.assert_array_equal(found, label)
+    label[15:20] = 0  # without the band the tuft is an island that no mesh explains
+    assert not clean_labels(label, support, hole_fraction=0.01, island_fraction=0.05)[:20].any()
+
+
 def test_flicker_of_one_frame_is_repaired_where_the_mesh_agrees():
     still = np.zeros((32, 32), np.uint8)
     still[4:28, 4:28] = 1
