@@ -11,7 +11,7 @@ and writes a frame pack (zip of PNGs and manifest.json, see `nbavatar.io.framepa
   rgb       uint8 [H, W, 3]   sRGB
   person    uint8 [H, W]      matte of the whole person                       decaf, and captures with mattes
   label     uint8 [H, W]      0 background, 1 head, 2 right, 3 left hand,     captures with label masks
-                              255 says nothing: something else is in front
+                              255 unknown: something else is in front
   alpha     uint8 [H, W]      coverage, 255 = full                            captures with label masks or alpha images
 
 The manifest carries K [px, pixel centres at +0.5], cam_from_world [m], distortion, frame ids, train/test split and

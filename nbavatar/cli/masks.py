@@ -8,7 +8,7 @@ only, or video without loss) or mattes of the person.
 Writes a frame pack of the same frames, size and camera (still distorted):
 
   label     uint8 [H, W]      0 background, 1 head with neck and hair, 2 right hand, 3 left hand (above the wrist),
-                              255 says nothing: something else is in front
+                              255 unknown: something else is in front
   alpha     uint8 [H, W]      coverage, 255 = full
 
 Whatever is neither head nor hand (torso, arms) becomes background, unless `keep` is `person`; or 255 where it hides a

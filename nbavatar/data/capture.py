@@ -2,7 +2,7 @@
 
     cameras.json                       camera -> width, height, K, R, t (world-to-camera, OpenCV) [, distortion]
     images/<camera>/<frame>.<type>     jpg, png or webp
-    masks/<camera>/<frame>.png         0 background, 1 head, 2 right hand, 3 left hand, 255 says nothing;
+    masks/<camera>/<frame>.png         0 background, 1 head, 2 right hand, 3 left hand, 255 unknown;
                                        or a matte of the whole person
     alpha/<camera>/<frame>.png         optional coverage
     meshes/topology.npz                head_faces, right_hand_faces, left_hand_faces: any subset [, <part>_rest]

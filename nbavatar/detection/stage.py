@@ -53,7 +53,7 @@ class Detector:
 
         Args:
             frames: image uint8 `[H, W, 3]` RGB; mask uint8 `[H, W]` or None; whether the mask has labels (0 background,
-                1 head, 2 right, 3 left hand, 255 says nothing) or is a matte of the person.
+                1 head, 2 right, 3 left hand, 255 unknown) or is a matte of the person.
             starts: positions of frames that nothing may be carried into, such as those after a cut.
 
         Yields:

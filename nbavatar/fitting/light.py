@@ -11,7 +11,8 @@ favours lights that change little; from there on a and w are found in turns by l
 adds by its own place (gloss) counts as noise.
 
 Whether there is such a light is judged by frames that took no part: fitted to two of three frames, it has to explain
-how bright the others are better than the mean brightness of each face does.
+how bright the others are better than the mean brightness of each face does. Faces that hardly any light reaches in the
+frames of the fit are left out: their albedo cannot be told.
 
 Brightness is that of linear light (sRGB's transfer function undone, IEC 61966-2-1), mean over red, green and blue:
 coloured lights are taken for grey ones.
@@ -31,6 +32,7 @@ _FRAMES = 6  # fewest frames to tell light from skin
 _FACES = 50  # fewest faces
 _MOST = 8.0  # pixels from which on a face's mean brightness counts no more
 _DARK = 1e-3  # brightness below which nothing is said
+_LIT = 0.05  # least light, in the mean of the frames of the fit, from which a face's albedo can be told
 _RIDGE, _LOOSE = (
     1e-3,
     1e-4,
@@ -208,7 +210,9 @@ def _explained(
 ) -> float:
     """Share of the squared deviation from each face's mean, in the frames `held`, that the light explains."""
     shine = _shine(incident, strengths)
-    there = (weight[~held] > 0).sum(0) >= _SEEN
+    # In the dark of an ear or a nostril light is divided by next to nothing: one face of albedo 40 outweighed all others.
+    lit = _mean(shine[~held], weight[~held]) > _LIT
+    there = ((weight[~held] > 0).sum(0) >= _SEEN) & lit
     albedo = _albedo(light[~held], weight[~held], shine[~held])
     mean = _mean(light[~held], weight[~held])
     judged = weight[held] * there

@@ -8,7 +8,7 @@ is compressed already; PNG, because it is lossless and everything opens it.
     rgb     colour, sRGB, straight alpha                 uint8 [H, W, 3]
     person  matte of the whole person, as delivered      uint8 [H, W]
     label   0 background, 1 head, 2 right, 3 left hand,  uint8 [H, W]
-            255 says nothing
+            255 unknown
     alpha   coverage of the labelled parts, 255 = full   uint8 [H, W]
 
 Pixels that say nothing have the label 255: what lies outside the camera's image in a crop that sticks out of it, and

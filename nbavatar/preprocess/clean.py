@@ -27,7 +27,7 @@ def clean_labels(label: np.ndarray, support: np.ndarray, *, hole_fraction: float
     fingertip that is seen beyond another finger) or touches pixels that say nothing, behind which it may go on.
 
     Args:
-        label: uint8 `[H, W]`, 0 = background, 255 = says nothing, which stays so.
+        label: uint8 `[H, W]`, 0 = background, 255 = unknown, which stays so.
         support: uint8 `[H, W]`, labels of the projected meshes.
         hole_fraction: share of the area of all parts.
         island_fraction: share of the area of the part.

@@ -81,8 +81,8 @@ def resize_area(image: np.ndarray, size: int) -> np.ndarray:
 
 def resize_unseen(unseen: np.ndarray, size: int) -> np.ndarray:
     """Resizes a mask of pixels that say nothing, bool `[S, S]`: of a pixel that has a part of one nothing is known."""
-    if unseen.shape[0] == size or not unseen.any():
-        return unseen if unseen.shape[0] == size else np.zeros((size, size), bool)
+    if unseen.shape[0] == size:
+        return unseen
     return resize_area(np.where(unseen, np.uint8(255), np.uint8(0)), size) > 0
 
 

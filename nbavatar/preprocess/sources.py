@@ -22,7 +22,7 @@ __all__ = ["LAYERS", "camera_of", "capture_images", "capture_layers", "decaf_ima
 LAYERS = {
     "rgb": "colour, sRGB, uint8",
     "person": "matte of the whole person as delivered, 0..255",
-    "label": "0 background, 1 head, 2 right hand, 3 left hand, 255 says nothing",
+    "label": "0 background, 1 head, 2 right hand, 3 left hand, 255 unknown",
     "alpha": "coverage of the labelled parts, 0..255",
 }
 

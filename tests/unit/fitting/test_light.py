@@ -61,6 +61,20 @@ def test_known_lamps_are_found() -> None:
     assert light.weights[near].sum() > 0.6 * light.weights.sum()
 
 
+def test_faces_in_the_dark_do_not_outweigh_all_others() -> None:
+    """The inside of an ear: lit by its surroundings alone in the frames of the fit, by a lamp in one that is left out."""
+    scene = _Turning()
+    fit = np.arange(FRAMES) % 3 != 1
+    known, said = estimate_light(scene.incident, scene.seen, LIGHTS, kept=24, least=0.1)
+    ear = np.arange(0, 60, 20)
+    scene.incident[np.ix_(fit, np.arange(len(LIGHTS)), ear)] *= 1e-3
+    scene.seen.pixels[:, ear] = 5.0
+    scene.seen.light[:, ear] = 5.0 * 0.15
+    light, judged = estimate_light(scene.incident, scene.seen, LIGHTS, kept=24, least=0.1)
+    assert abs(judged["explained"] - said["explained"]) < 0.02
+    np.testing.assert_allclose(light.weights @ light.directions, known.weights @ known.directions, atol=0.2)
+
+
 def test_brightness_that_does_not_follow_a_light_is_none() -> None:
     scene = _Turning()
     flat = Brightness(scene.pixels * scene.albedo, scene.pixels)
