@@ -210,7 +210,7 @@ def _explained(
 ) -> float:
     """Share of the squared deviation from each face's mean, in the frames `held`, that the light explains."""
     shine = _shine(incident, strengths)
-    # In the dark of an ear or a nostril light is divided by next to nothing: one face of albedo 40 outweighed all others.
+    # In the dark of an ear light is divided by next to nothing: one face of albedo 40 outweighed all others.
     lit = _mean(shine[~held], weight[~held]) > _LIT
     there = ((weight[~held] > 0).sum(0) >= _SEEN) & lit
     albedo = _albedo(light[~held], weight[~held], shine[~held])

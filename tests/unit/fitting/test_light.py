@@ -62,7 +62,7 @@ def test_known_lamps_are_found() -> None:
 
 
 def test_faces_in_the_dark_do_not_outweigh_all_others() -> None:
-    """The inside of an ear: lit by its surroundings alone in the frames of the fit, by a lamp in one that is left out."""
+    """The inside of an ear: lit by its surroundings alone in the frames of the fit, by a lamp in another one."""
     scene = _Turning()
     fit = np.arange(FRAMES) % 3 != 1
     known, said = estimate_light(scene.incident, scene.seen, LIGHTS, kept=24, least=0.1)
