@@ -5,8 +5,9 @@
 
 `make pictures` runs it. The avatar is that of config/capture.yaml with the changes of tools/pictures.yaml; its training
 took 23 minutes on one core beside other work, everything together half an hour. What is done already is not done
-again. With other --results, only their avatar is drawn. Everything is shown from a camera, or a place, that no training saw. The viewer
-is photographed in headless Chromium (Debian: apt-get install chromium); without one its picture stays as it is.
+again. With other --results, only their avatar is drawn. Everything is shown from a camera, or a place, that no training
+saw. The viewer is photographed in headless Chromium (Debian: apt-get install chromium); without one its picture stays
+as it is.
 """
 
 import argparse
