@@ -26,7 +26,7 @@ from nbavatar.data.capture import (
 from nbavatar.data.mesh_checks import mesh_faults
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
-from nbavatar.io.framepack import UNSEEN, unseen_in
+from nbavatar.io.framepack import UNSEEN, parts_in
 from nbavatar.mesh.topology import mesh_defects
 from nbavatar.preprocess.capture_masks import CameraMasks, open_masks
 from nbavatar.preprocess.mask_values import Meaning
@@ -61,6 +61,7 @@ class CaptureReport:
         topology: faces and rest vertices of the parts.
         masks: camera -> its masks, if they can be read.
         meanings: camera -> what the masks that are used mean, if they can be read.
+        labels: all labels that these masks hold.
     """
 
     defects: list[str] = dataclasses.field(default_factory=list)
@@ -73,6 +74,7 @@ class CaptureReport:
     topology: dict[str, tuple[np.ndarray, np.ndarray | None]] = dataclasses.field(default_factory=dict)
     masks: dict[str, CameraMasks] = dataclasses.field(default_factory=dict)
     meanings: dict[str, Meaning] = dataclasses.field(default_factory=dict)
+    labels: set[int] = dataclasses.field(default_factory=set)
 
 
 def check_capture(
@@ -122,7 +124,7 @@ def check_capture(
         _check_camera(capture, camera, report, found, judge, progress)
     if meshes:
         _check_poses(root, judge, report, found)
-    if UNSEEN in found.labels and set(report.meanings) == set(cameras):
+    if UNSEEN in report.labels and set(report.meanings) == set(cameras):
         _check_hidden(Path(supplied) if supplied else root / "masks", report, found)
     if len(cameras) == 1:
         report.notes.append(f"{root / 'cameras.json'}: one camera only; held-out poses are judged, new views are not")
@@ -293,7 +295,7 @@ def _check_masks(
         assert mask is not None
         person = mask if labelled else (mask > MATTE_THRESHOLD).astype(np.uint8)
         count += 1
-        if not person[~unseen_in(person)].any():
+        if not parts_in(person).any():
             empty.append(frame)
         if labelled:
             labels |= set(np.unique(mask).tolist())
@@ -308,7 +310,7 @@ def _check_masks(
     elif empty:
         more = f" (and {len(empty) - 1} more frames)" if len(empty) > 1 else ""
         report.notes.append(f"{folder / empty[0]}: the mask shows nobody{more}")
-    found.labels |= labels
+    report.labels |= labels
     for value in sorted(labels - {0, UNSEEN}):
         part = PARTS[value - 1]
         if report.topology and part not in report.topology:
@@ -321,7 +323,7 @@ def _check_hidden(masks: Path, report: CaptureReport, found: Collector) -> None:
     """Refuses masks whose 255 seems to be meant for a part: one with a mesh and without its label in any mask."""
     for part in report.topology:
         label = PARTS.index(part) + 1
-        if label not in found.labels:
+        if label not in report.labels:
             expected, fix = f"label {label} in a mask, as it has a mesh", f"store {label} where the part is seen"
             line = DataError.of(masks, part, expected=expected, found="none, and 255 (something in front)", fix=fix)
             found.note(f"hidden {part}", str(line))

@@ -14,14 +14,10 @@ class Collector:
 
     Args:
         lines: where they go when it is closed.
-
-    Attributes:
-        labels: all values that label masks were seen to hold.
     """
 
     def __init__(self, lines: list[str]) -> None:
         self._lines, self._groups = lines, {}
-        self.labels: set[int] = set()
 
     def attempt(self, group: str, call: Callable[[], Any]) -> Any:
         """The call's result, or None after noting its error."""

@@ -17,7 +17,7 @@ from nbavatar.camera.distortion import distort_vertices
 from nbavatar.camera.pinhole import Camera
 from nbavatar.data.sequences import PARTS
 from nbavatar.errors import DataError
-from nbavatar.io.framepack import unseen_in
+from nbavatar.io.framepack import parts_in, unseen_in
 from nbavatar.mesh.zbuffer import joined_meshes, rasterize_mesh
 
 __all__ = ["PoseJudge", "sampled_frames"]
@@ -163,7 +163,7 @@ class PoseJudge:
         """
         step = self._step(self._cameras[camera])
         small = np.ascontiguousarray(mask[step // 2 :: step, step // 2 :: step])
-        if frame in self._meshes and small[~unseen_in(small)].any():
+        if frame in self._meshes and parts_in(small).any():
             self._views.setdefault(camera, []).append(_View(frame, small, labelled))
             self._known.clear()
 
@@ -351,7 +351,7 @@ class PoseJudge:
         face, _, _ = rasterize_mesh(points, faces, K, width, height)
         known = ~unseen_in(view.mask)
         drawn = (face >= 0) & known
-        there = (view.mask > 0) & known
+        there = parts_in(view.mask)
         both = float((drawn & there).sum())
         if view.labelled:
             # A part that is in the mask has to be drawn as well: it may lie outside the image.

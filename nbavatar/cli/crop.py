@@ -79,15 +79,16 @@ def main(args: argparse.Namespace) -> None:
                 if window is None or (window.x0, window.y0, window.side) != plan.windows[frame]:
                     window = Window(*plan.windows[frame], camera.K, camera.distortion)
                     outside = window.unseen(camera.height, camera.width, plan.size)
-                label = masks.read("label", frame)
-                covered = window.cut(np.where(unseen_in(label), np.uint8(255), np.uint8(0))) > 0
-                label = window.cut(label, labels=True)
-                label[covered] = 0
+                given, unseen = masks.read("label", frame), outside
+                label = window.cut(given, labels=True)
+                if (hidden := unseen_in(given)).any():
+                    covered = window.cut(np.where(hidden, np.uint8(255), np.uint8(0))) > 0
+                    label[covered] = 0
+                    unseen = outside | resize_unseen(covered, plan.size)
                 alpha = window.cut(masks.read("alpha", frame))
                 rgb = window.cut(pack.read("rgb", frame))
                 rgb = resize_area(rgb, plan.size)
                 label, alpha = resize_labels(label, alpha, plan.size)
-                unseen = outside | resize_unseen(covered, plan.size)
                 out.manifest["unseen"] |= bool(unseen.any())
                 mark_unseen(label, alpha, unseen)
                 out.add("rgb", frame, estimate_foreground(rgb, alpha) if cfg.edge_color else rgb)

@@ -40,7 +40,7 @@ from nbavatar.data.capture import Capture, Splits, open_capture, read_rgb, read_
 from nbavatar.devices import lease_device
 from nbavatar.errors import ConfigError, DataError
 from nbavatar.io.atomic import atomic_write
-from nbavatar.io.framepack import unseen_in
+from nbavatar.io.framepack import parts_in
 from nbavatar.io.images import encode_png
 from nbavatar.io.records import write_json
 from nbavatar.preprocess.overlay import contact_sheet, mask_outline
@@ -138,7 +138,7 @@ def _write_camera(
             _masks(capture, splits, camera, segment), f"segment {camera.name}", len(frames)
         ):
             label = mask if labelled else (mask > MATTE_THRESHOLD).astype(np.uint8)
-            empty += not (mask[~unseen_in(mask)] if labelled else mask).any()
+            empty += not (parts_in(mask) if labelled else mask).any()
             (temporary / f"{frame}.png").write_bytes(encode_png(mask))
             if frame in chosen:
                 shown.append((f"{camera.name} {frame}", mask_outline(image, label)))

@@ -97,8 +97,8 @@ class MasksConfig:
     )
     covered: str = option(
         "background",
-        "What counts in a matte as where something that is neither head nor hand (a collar, a sleeve) hides a mesh: "
-        "background; or unknown, where nothing is learnt and nothing judged. Masks with labels say so by 255.",
+        "What pixels of a matte count as where a collar or a sleeve, neither head nor hand, hides a mesh: background; "
+        "or unknown, which training and evaluation ignore. Masks with labels say so by 255.",
         choices=("background", "unknown"),
     )
     hole_fraction: float = option(0.002, "Holes smaller than this share of the part are filled [1].", min=0.0, max=1.0)

@@ -208,7 +208,7 @@ def _evaluate(
     per_image: list[dict] = []
     answers: dict[str, list[dict]] = {}
     seen = {"prediction": hashlib.sha256(), "truth": hashlib.sha256()}
-    cached: dict[str, tuple[Tensor, Mapping[str, Sequence[Tensor]]]] = {}
+    cached: dict[str, tuple[bytes, Tensor, Mapping[str, Sequence[Tensor]]]] = {}
     size: tuple[int, int] | None = None
     first = next(iter(nets), None)
     for pair in pairs:
@@ -241,15 +241,13 @@ def _evaluate(
         per_image.append({"camera": pair.camera, "frame": pair.frame, **values})
         if not trivial:
             continue
-        for answer, key, make in _trivial_answers(pair, background, means):
-            if key not in cached:
+        for answer, key, version, make in _trivial_answers(pair, background, means):
+            if key not in cached or cached[key][0] != version:
                 image = _tensor(make(), device)
                 with torch.inference_mode():
                     known = {first: nets[first].features(image)} if first is not None else {}
-                if key:
-                    cached[key] = (image, known)
-            else:
-                image, known = cached[key]
+                cached[key] = version, image, known
+            _, image, known = cached[key]
             answers.setdefault(answer, []).append(
                 measure(image, truth, mask, nets, {name: features[name] for name in known}, known)
             )
@@ -271,25 +269,26 @@ def _evaluate(
 
 def _trivial_answers(
     pair: Pair, background: Sequence[float], means: Mapping[str, np.ndarray] | None
-) -> Iterator[tuple[str, str, Callable[[], np.ndarray]]]:
-    """(answer, key under which its image is kept or "" where it is not, function that makes the image)."""
+) -> Iterator[tuple[str, str, bytes, Callable[[], np.ndarray]]]:
+    """(answer, key under which its image is kept, which version of it, function that makes the image)."""
     shape = pair.rgb.shape
 
     def empty() -> np.ndarray:
         return np.broadcast_to(np.asarray(background, dtype=np.float32), shape).copy()
 
-    yield "background", "background", empty
+    yield "background", "background", b"", empty
     camera = pair.camera if means and pair.camera in means else ""
     if means and camera in means:
         if means[camera].shape != shape:
             expected = f"{shape[1]}x{shape[0]}, as the truth"
             found = "x".join(map(str, means[camera].shape[1::-1]))
             raise DataError.of("training images", expected=expected, found=found)
-        unseen = pair.unseen
-        if unseen is None:
-            yield "mean_image", f"mean of {camera}", lambda: means[camera]
-        else:
-            yield "mean_image", "", lambda: np.where(unseen[..., None], empty(), means[camera])
+
+        def mean() -> np.ndarray:
+            return means[camera] if pair.unseen is None else np.where(pair.unseen[..., None], empty(), means[camera])
+
+        version = b"" if pair.unseen is None else pair.unseen.tobytes()
+        yield "mean_image", f"mean of {camera}", version, mean
 
 
 def _means(values: Sequence[Mapping[str, object]]) -> dict[str, float | None]:

@@ -36,7 +36,7 @@ from nbavatar.io.pictures import MOST_PIXELS
 from nbavatar.io.records import canonical_json
 from nbavatar.names import check_name
 
-__all__ = ["FORMAT", "UNSEEN", "FramePack", "FramePackWriter", "mark_unseen", "unseen_in"]
+__all__ = ["FORMAT", "UNSEEN", "FramePack", "FramePackWriter", "mark_unseen", "parts_in", "unseen_in"]
 
 FORMAT = 1
 UNSEEN = 255
@@ -59,6 +59,11 @@ def mark_unseen(label: np.ndarray, alpha: np.ndarray, unseen: np.ndarray) -> Non
 def unseen_in(label: np.ndarray) -> np.ndarray:
     """Pixels that `mark_unseen` has marked in labels, bool of their shape."""
     return label == UNSEEN
+
+
+def parts_in(label: np.ndarray) -> np.ndarray:
+    """Pixels of labels that show a part, bool of their shape."""
+    return (label > 0) & ~unseen_in(label)
 
 
 class FramePackWriter:

@@ -86,7 +86,7 @@ def _compare(masks: CameraMasks, frames: Sequence[str]) -> None:
     for frame in frames:
         mask, alpha = masks.read_mask(frame), masks.read_coverage(frame)
         if mask is not None and alpha is not None:
-            if least == 0:
+            if masks.mask is not None and masks.mask.unseen:
                 mask, alpha = (np.where(unseen_in(mask), np.uint8(0), plane) for plane in (mask, alpha))
             masked += int((mask > least).sum())
             covered += int(((mask > least) & (alpha > MATTE_THRESHOLD)).sum())

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from nbavatar.io.framepack import unseen_in
+from nbavatar.io.framepack import parts_in, unseen_in
 
 __all__ = ["clean_labels", "repair_flicker", "spread_labels", "threshold_matte"]
 
@@ -36,10 +36,10 @@ def clean_labels(label: np.ndarray, support: np.ndarray, *, hole_fraction: float
         uint8 `[H, W]`, a new array.
     """
     result = label.copy()
-    unseen = unseen_in(label)
-    total = int(((label > 0) & ~unseen).sum())
+    parts, unseen = parts_in(label), unseen_in(label)
+    total = int(parts.sum())
     beside = cv2.dilate(unseen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 if unseen.any() else unseen
-    for value in np.unique(label[(label > 0) & ~unseen]):
+    for value in np.unique(label[parts]):
         count, pieces, stats, _ = cv2.connectedComponentsWithStats((label == value).astype(np.uint8), connectivity=8)
         if count <= 2:
             continue

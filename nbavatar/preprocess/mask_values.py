@@ -85,7 +85,7 @@ def spread(names: Sequence[str], most: int = 256) -> list[str]:
 
 
 def labels_in(values: np.ndarray) -> set[int]:
-    """Which of the labels 1..3 and 255 a picture holds; none where it holds anything else beside the background."""
+    """Which of the labels 1..3 and 255 are among values; none where anything else is there beside the background."""
     there = set(np.unique(values).tolist()) - {0}
     return there if there <= {*range(1, LABELS + 1), UNSEEN} else set()
 
@@ -130,7 +130,7 @@ class ValueSurvey:
         self._flat[: len(flat)] += flat
         if top > LABELS:
             self._above += 1
-            self._unseen |= bool(counts[1 : LABELS + 1].any() and self._labels_alone(counts))
+            self._unseen |= {UNSEEN} < labels_in(np.flatnonzero(counts))
         elif flat[1 : LABELS + 1].sum() > _PATCH * values.size:
             self._labelled.append(name)
 
@@ -155,7 +155,7 @@ class ValueSurvey:
                 raise DataError.of(where, "values", expected=f"labels 0..{LABELS} or 0..255", found=found, fix=fix)
             meaning = Meaning("person", 1) if top == 1 and set(parts) - {"head"} else Meaning("label", 0)
             return self._with_background(meaning, where)
-        if self._unseen and not self._lossy and self._labels_alone(self._counts) and self._parts_show():
+        if self._unseen and not self._lossy and labels_in(np.flatnonzero(self._counts)) and self._parts_show():
             return self._with_background(Meaning("label", 0, unseen=True), where)
         if self._labelled and not self._lossy:
             found = f"{self._above} of {self._pictures} masks with values above 3, and labels in {self._labelled[0]}"
@@ -182,12 +182,6 @@ class ValueSurvey:
             found = f"none in {self._pictures} pictures"
             raise DataError.of(where, "values", expected="background (0) somewhere", found=found, fix=_FIX)
         return meaning
-
-    @staticmethod
-    def _labels_alone(counts: np.ndarray) -> bool:
-        """Whether all values that are there are labels, or that of pixels that say nothing."""
-        there = counts.nonzero()[0]
-        return bool(((there <= LABELS) | (there == UNSEEN)).all())
 
     def _parts_show(self) -> bool:
         """Whether labels of parts are more than strays: a hard matte may have a pixel of another value."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import cv2
 import numpy as np
 
-from nbavatar.io.framepack import UNSEEN, mark_unseen, unseen_in
+from nbavatar.io.framepack import UNSEEN, mark_unseen, parts_in, unseen_in
 from nbavatar.preprocess.clean import clean_labels, repair_flicker
 from nbavatar.preprocess.clothes import ClothesModel
 from nbavatar.preprocess.part_masks import PartCutter
@@ -116,7 +116,7 @@ def _prepare(
         other = (mask > numbers.threshold) & (label == 0)
         statistics.dropped += int(other.sum())
         if numbers.covered == "unknown":
-            label[other & outlines.meshes] = UNSEEN
+            label[other & outlines.meshes()] = UNSEEN
     else:
         label = mask
     cleaned = clean_labels(
@@ -142,8 +142,7 @@ def _finish(
         if run_of.get(before.name) == run_of.get(now.name) == run_of.get(after.name):
             label = repair_flicker(before.label, now.label, after.label, now.support)
             statistics.flicker += int((label != now.label).sum())
-    unseen = unseen_in(label)
-    part = (label > 0) & ~unseen
+    unseen, part = unseen_in(label), parts_in(label)
     if now.coverage is not None:
         alpha = np.where(part, now.coverage, np.uint8(0))
     else:

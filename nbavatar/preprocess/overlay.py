@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from nbavatar.io.framepack import unseen_in
+from nbavatar.io.framepack import parts_in
 
 __all__ = ["PART_COLORS", "contact_sheet", "mask_outline", "shade"]
 
@@ -42,7 +42,7 @@ def mask_outline(image: np.ndarray, label: np.ndarray, color: Sequence[int] = (2
     """Draws the outline of every part of a label image, uint8 RGB `[H, W, 3]`; none of what says nothing (255)."""
     result = image.copy()
     width = max(1, round(max(image.shape[:2]) / 500))
-    for value in np.unique(label[(label > 0) & ~unseen_in(label)]):
+    for value in np.unique(label[parts_in(label)]):
         shapes, _ = cv2.findContours((label == value).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(result, shapes, -1, tuple(int(c) for c in color), width)
     return result

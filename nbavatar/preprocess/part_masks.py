@@ -14,6 +14,7 @@ beyond the sleeve's length counts as head.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -60,7 +61,7 @@ class Silhouettes:
         face: bool `[H, W]`, upper head, where no clothes are.
         neck: bool `[H, W]`, lower head and all around the surfaces, where clothes may be.
         torso: bool `[H, W]`, nearest to the collar: torso, if the matte has anything there.
-        meshes: bool `[H, W]`, where a part's mesh is, in front or behind a sleeve.
+        meshes: draws bool `[H, W]`, where a part's mesh is, whatever is in front of it.
     """
 
     support: np.ndarray
@@ -69,7 +70,7 @@ class Silhouettes:
     face: np.ndarray
     neck: np.ndarray
     torso: np.ndarray
-    meshes: np.ndarray
+    meshes: Callable[[], np.ndarray]
 
 
 class PartCutter:
@@ -137,12 +138,14 @@ class PartCutter:
             points[rows] = (0.0, 0.0, -1.0)
         points = distort_vertices(points, self._camera.distortion, self._reach)
         width, height = self._camera.width, self._camera.height
+
+        def meshes() -> np.ndarray:
+            camera, faces = self._camera, self._faces[self._owner > 0]
+            own, _, _ = rasterize_mesh(points, faces, camera.K, camera.width, camera.height)
+            return np.asarray(own >= 0)
+
         face, _, depth = rasterize_mesh(points, self._faces[self._solid], self._camera.K, width, height)
         face = np.where(face >= 0, np.flatnonzero(self._solid)[face], -1)
-        meshes = (face >= 0) & (self._owner[face] > 0)
-        if (sleeve := (face >= 0) & ~meshes).any():
-            own, _, _ = rasterize_mesh(points, self._faces[self._owner > 0], self._camera.K, width, height)
-            meshes |= sleeve & (own >= 0)
         if not self._solid.all():
             soft = np.flatnonzero(~self._solid)
             behind, _, far = rasterize_mesh(points, self._faces[soft], self._camera.K, width, height)
@@ -151,7 +154,7 @@ class PartCutter:
         support = np.where(face >= 0, self._owner[face], np.uint8(0))
         if not (face >= 0).any():
             nowhere = np.zeros(face.shape, dtype=bool)
-            return Silhouettes(support, support, np.zeros(face.shape, np.float32), nowhere, nowhere, nowhere, nowhere)
+            return Silhouettes(support, support, np.zeros(face.shape, np.float32), nowhere, nowhere, nowhere, meshes)
         distance, index = _nearest(face >= 0)
         near_face = face.reshape(-1)[index]
         pixels = (float(self._camera.K[0, 0]) / depth.reshape(-1)[index] * self._margin[near_face]).astype(np.float32)
