@@ -7,7 +7,8 @@ import functools
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
+
+from nbavatar.math.blur import blur
 
 __all__ = ["WINDOW", "loss_dssim", "loss_l1", "loss_mse"]
 
@@ -57,27 +58,18 @@ def loss_dssim(image: Tensor, target: Tensor, *, pixels: int | None = None) -> T
         Scalar in [0, 2]; 0 where the images are equal.
     """
     channels, height, width = image.shape
-    stacked = torch.stack((image, target))
-    moments = torch.cat((stacked, stacked.square(), (image * target)[None]))
-    blurred = _blur(moments.flatten(0, 1)[:, None]).view(5, channels, height, width)
-    mean_x, mean_y, square_x, square_y, product = blurred
-    covariance = product - mean_x * mean_y
-    variances = (square_x - mean_x.square()) + (square_y - mean_y.square())
-    ssim = (2 * mean_x * mean_y + _C1) * (2 * covariance + _C2)
-    ssim = ssim / ((mean_x.square() + mean_y.square() + _C1) * (variances + _C2))
+    # The variances count as their sum only, so the squares are blurred together.
+    moments = torch.stack((image, target, image.square() + target.square(), image * target))
+    blurred = blur(moments.flatten(0, 1), _taps(image.dtype, image.device)).view(4, channels, height, width)
+    mean_x, mean_y, squares, product = blurred
+    means, energy = mean_x * mean_y, mean_x.square() + mean_y.square()
+    ssim = (2 * means + _C1) * (2 * (product - means) + _C2)
+    ssim = ssim / ((energy + _C1) * (squares - energy + _C2))
     return (1.0 - ssim).sum() / (channels * (pixels or height * width))
-
-
-def _blur(planes: Tensor) -> Tensor:
-    """Gaussian window over planes (B, 1, h, w), zeros beyond."""
-    # One group a plane: torch has a fast kernel for that, and none for one channel in a batch.
-    count, taps = len(planes), _taps(planes.dtype, planes.device).expand(len(planes), 1, WINDOW)
-    rows = F.conv2d(planes.transpose(0, 1), taps[..., None], padding=(WINDOW // 2, 0), groups=count)
-    return F.conv2d(rows, taps[:, :, None], padding=(0, WINDOW // 2), groups=count).transpose(0, 1)
 
 
 @functools.cache
 def _taps(dtype: torch.dtype, device: torch.device) -> Tensor:
     offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
     taps = torch.exp(-offsets.square() / (2 * _SIGMA**2))
-    return (taps / taps.sum()).to(dtype=dtype, device=device).view(1, 1, WINDOW)
+    return (taps / taps.sum()).to(dtype=dtype, device=device)

@@ -32,13 +32,19 @@ def parse_order(order: str) -> int:
 
 
 def canonical_rank(
-    depth: Tensor, means: Tensor, quats: Tensor, half_extents: Tensor, features: Tensor, alpha: Tensor
+    depth: Tensor,
+    means: Tensor,
+    quats: Tensor,
+    half_extents: Tensor,
+    features: Tensor,
+    alpha: Tensor,
+    uniform: Tensor | None = None,
 ) -> Tensor:
     """Billboards in the order of their rank.
 
     Args:
         depth: (F,) depth of the centres.
-        means, quats, half_extents, features, alpha: the billboards, (F, ...).
+        means, quats, half_extents, features, alpha, uniform: the billboards, (F, ...), see `render_billboards`.
 
     Returns:
         (F,) int64 indices; `result[0]` is the billboard that comes first.
@@ -59,13 +65,14 @@ def canonical_rank(
         geometry = torch.cat([depth[members, None].double(), means[members].double(), quats[members].double(),
                               half_extents[members].double()], 1).cpu().numpy()  # fmt: skip
     order = np.lexsort(geometry.T[::-1])
-    order = _order_twins(order, geometry, members.cpu().numpy(), alpha, features)
+    textures = (alpha, features) if uniform is None else (alpha, features, uniform)
+    order = _order_twins(order, geometry, members.cpu().numpy(), textures)
     rank[places] = members[torch.from_numpy(order).to(members.device)]
     return rank
 
 
 def _order_twins(
-    order: np.ndarray, geometry: np.ndarray, members: np.ndarray, alpha: Tensor, features: Tensor
+    order: np.ndarray, geometry: np.ndarray, members: np.ndarray, textures: tuple[Tensor, ...]
 ) -> np.ndarray:
     """Orders runs of billboards of identical geometry by their textures, in the same way in every precision."""
     sorted_geometry = geometry[order]
@@ -80,9 +87,8 @@ def _order_twins(
 
             def texture_bytes(position: int) -> bytes:
                 row = int(members[position])
-                parts = (alpha[row], features[row])
                 # Widened: float32 and float64 copies of one texture must compare alike.
-                return b"".join(part.detach().double().cpu().numpy().tobytes() for part in parts)
+                return b"".join(part[row].detach().double().cpu().numpy().tobytes() for part in textures)
 
             order[start:end] = sorted(run, key=texture_bytes)
     return order

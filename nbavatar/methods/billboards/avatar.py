@@ -21,7 +21,7 @@ from nbavatar.math.rotations import matrix_to_quaternion
 from nbavatar.mesh.frames import FaceFrames, face_frames
 from nbavatar.methods.base import MeshAvatar, Stages, compose
 from nbavatar.methods.billboards.architecture import Architecture, check_stored
-from nbavatar.methods.billboards.billboards import Billboards, Posed, mirrored_sight, with_light
+from nbavatar.methods.billboards.billboards import Billboards, Posed, mirrored_sight
 from nbavatar.methods.billboards.compression.sized import SizedBillboards
 from nbavatar.methods.billboards.engine import DecoderEngine
 from nbavatar.methods.billboards.refine import Refinement
@@ -197,7 +197,6 @@ class Avatar(MeshAvatar):
         features, alpha = self.textures()
         if keep is not None:
             features, alpha = features[keep], alpha[keep]
-        features = self.drawn(features, posed, viewmat)
         region = full_region(width, height, self.multiple)
         if a.roi if roi is None else roi:
             region = region_of(posed, viewmat, K, width, height, multiple=self.multiple, margin=a.roi_margin)
@@ -212,6 +211,7 @@ class Avatar(MeshAvatar):
             region.width,
             region.height,
             order=order or a.order,
+            uniform=self.told(posed, viewmat),
         )
         if a.gloss:
             # Whatever the loss would like gloss to be, billboards neither move nor fade for it: trainings that let them
@@ -225,12 +225,16 @@ class Avatar(MeshAvatar):
         features = self.billboards.features
         return (features if self.unet is not None else torch.sigmoid(features)), self.billboards.alpha()
 
-    def drawn(self, features: Tensor, posed: Posed, viewmat: Tensor) -> Tensor:
-        """What is rasterized for the decoder: features (F, T, T, C), behind them what it is told of light and gloss."""
-        told = posed.light
-        if self.architecture.gloss:
-            told = torch.cat((told, mirrored_sight(told[:, :3], posed.means.detach(), viewmat)), dim=1)
-        return with_light(features, told)
+    def told(self, posed: Posed, viewmat: Tensor) -> Tensor:
+        """What is rasterized for the decoder beside the textures: light and gloss of each billboard (F, L).
+
+        Not part of the paper. Where light stands still, how bright a surface is depends on its direction in the world
+        and on what shadows it, and a texture that rides with the mesh cannot say so.
+        """
+        if not self.architecture.gloss:
+            return posed.light
+        sight = mirrored_sight(posed.light[:, :3], posed.means.detach(), viewmat)
+        return torch.cat((posed.light, sight), dim=1)
 
     def use_engine(self, kind: str) -> str:
         """See `MeshAvatar.use_engine`."""
@@ -317,19 +321,19 @@ class Avatar(MeshAvatar):
             if keep is not None:
                 features, alpha = features[keep], alpha[keep]
             window = self.window(posed, keep, viewmat, K, width, height)
-            drawn = self.drawn(features, posed, viewmat)
+            told = self.told(posed, viewmat)
             rgb = features[..., [min(i, features.shape[-1] - 1) for i in range(3)]].contiguous()
         region = window.region
 
-        def raster(values: Tensor) -> Callable[[], Any]:
+        def raster(values: Tensor, uniform: Tensor | None = None) -> Callable[[], Any]:
             return lambda: render_billboards(
                 *posed.planes, values, alpha, viewmat, shift_camera(K, region), region.width, region.height,
-                order=self.architecture.order,
+                order=self.architecture.order, uniform=uniform,
             )  # fmt: skip
 
         calls: dict[str, Callable[[], Any]] = {
             "pose": lambda: self.pose(verts),
-            "raster": raster(drawn),
+            "raster": raster(features, told),
             "raster_rgb": raster(rgb),
             "compose": lambda: compose(window.colour, window.alpha, background),
         }

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from nbavatar.math.rotations import matrix_to_quaternion, normalize_quaternion, quaternion_multiply
 from nbavatar.mesh.frames import FaceFrames
 
-__all__ = ["Billboards", "Posed", "gaussian_alpha_logits", "initial_half_extents", "mirrored_sight", "with_light"]
+__all__ = ["Billboards", "Posed", "gaussian_alpha_logits", "initial_half_extents", "mirrored_sight"]
 
 # Faces whose box would be thinner than this fraction of its longer side get this fraction: slivers stay visible.
 _THINNEST = 0.1
@@ -105,17 +105,6 @@ class Billboards(nn.Module):
     def alpha(self) -> Tensor:
         """Opacity textures in [0, 1], (F, T, T)."""
         return torch.sigmoid(self.alpha_logit)
-
-
-def with_light(features: Tensor, light: Tensor) -> Tensor:
-    """Textures (F, T, T, C) with the light (F, L) as L more channels, equal in all texels of a billboard.
-
-    Not part of the paper. Where light stands still, how bright a surface is depends on its direction in the world and
-    on what shadows it, and a texture that rides with the mesh cannot say so.
-    """
-    if light.shape[1] == 0:
-        return features
-    return torch.cat((features, light[:, None, None].expand(*features.shape[:-1], -1)), dim=-1)
 
 
 def mirrored_sight(normals: Tensor, points: Tensor, viewmat: Tensor) -> Tensor:

@@ -46,9 +46,17 @@ _SCRATCH = 1 << 26  # bytes that a worker may use; fewer rows are worked on at o
 
 
 def blend_cpu(
-    projection: ProjectedPatches, rank: Tensor, features: Tensor, alpha: Tensor, settings: BlendSettings
+    projection: ProjectedPatches,
+    rank: Tensor,
+    features: Tensor,
+    alpha: Tensor,
+    settings: BlendSettings,
+    uniform: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blends projected billboards front to back; arguments and results as `blend_reference`.
+
+    `uniform` (F, D): further channels, which all texels of a billboard have in common. They are not written to every
+    texel first: of thirteen channels of which seven are uniform a training step then copies half as much.
 
     Works in the wider dtype of `features` and `alpha`, float32 or float64 (half precision is
     widened, which copies the textures), and returns that dtype.
@@ -57,15 +65,17 @@ def blend_cpu(
         DataError: an alpha texture holds NaN.
         DeviceError: the memory needed is not there.
     """
-    dtype = torch.float64 if torch.float64 in (features.dtype, alpha.dtype) else torch.float32
-    inputs = (projection.plane, projection.fade, features.to(dtype).contiguous(), alpha.to(dtype).contiguous())
+    uniform = alpha.new_zeros((len(alpha), 0)) if uniform is None else uniform
+    textures = features, alpha, uniform
+    dtype = torch.float64 if torch.float64 in {values.dtype for values in textures} else torch.float32
+    inputs = (projection.plane, projection.fade, *(values.to(dtype).contiguous() for values in textures))
     return _Blend.apply(*inputs, projection, rank, settings)
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, plane, fade, features, alpha, projection, rank, settings):
-        scene = _Scene(projection, rank, features, alpha, settings)
+    def forward(ctx, plane, fade, features, alpha, uniform, projection, rank, settings):
+        scene = _Scene(projection, rank, features, alpha, uniform, settings)
         result = scene.forward()
         ctx.scene = scene
         ctx.save_for_backward(features, alpha)
@@ -75,15 +85,15 @@ class _Blend(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, *grads):
         _ = ctx.saved_tensors  # raises if a texture was changed in place since the forward pass
-        grad_features, grad_alpha, grad_plane, grad_fade = ctx.scene.backward(*grads)
-        return grad_plane, grad_fade, grad_features, grad_alpha, None, None, None
+        grad_features, grad_alpha, grad_uniform, grad_plane, grad_fade = ctx.scene.backward(*grads)
+        return grad_plane, grad_fade, grad_features, grad_alpha, grad_uniform, None, None, None
 
 
 def count_samples(
     projection: ProjectedPatches, rank: Tensor, features: Tensor, alpha: Tensor, settings: BlendSettings
 ) -> int:
     """Number of hits that are blended into the image."""
-    scene = _Scene(projection, rank, features.detach(), alpha.detach(), settings)
+    scene = _Scene(projection, rank, features.detach(), alpha.detach(), alpha.new_zeros((len(alpha), 0)), settings)
     scene.forward()
     return scene.samples
 
@@ -100,14 +110,19 @@ class _Scene:
     """One camera's billboards, binned, and the arrays that the kernels share."""
 
     def __init__(
-        self, projection: ProjectedPatches, rank: Tensor, features: Tensor, alpha: Tensor, settings: BlendSettings
-    ) -> None:
+        self, projection: ProjectedPatches, rank: Tensor, features: Tensor, alpha: Tensor, uniform: Tensor,
+        settings: BlendSettings,
+    ) -> None:  # fmt: skip
         s = self.settings = settings
         self.dtype = alpha.dtype
-        self.texels, self.channels, self.count = alpha.shape[-1], features.shape[-1], len(alpha)
+        self.texels, self.own, self.count = alpha.shape[-1], features.shape[-1], len(alpha)
+        self.uniform = uniform.shape[-1]
+        self.channels = self.own + self.uniform
         self.stride = -(-self.channels // LANES) * LANES
         prepare_kernels(self.dtype)
-        self.textures = Textures(features.detach().view(-1).numpy(), alpha.detach().view(-1).numpy())
+        rows = uniform.new_zeros((self.count, self.stride if self.uniform else 0))
+        rows[:, self.own : self.channels] = uniform.detach()
+        self.textures = Textures(*(values.detach().view(-1).numpy() for values in (features, alpha, rows)))
         self.bins = bin_billboards(
             projection, rank, self.texels, s.width, s.height, s.support, self.dtype, by_nearest=s.queue < 0
         )
@@ -146,23 +161,24 @@ class _Scene:
             capacity = int(self.lengths[tiles].max(initial=1))
         return image, opacity
 
-    def backward(self, grad_image: Tensor, grad_opacity: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gradients by features, alpha, plane and fade."""
+    def backward(self, grad_image: Tensor, grad_opacity: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Gradients by features, alpha, the uniform channels, plane and fade."""
         s = self.settings
         size = self.real.itemsize
         texels = self.count * self.texels**2
         require_memory(
-            texels * (self.channels + 1) * size + s.width * s.height * (self.stride + 1) * size,
+            texels * (self.own + 1) * size + s.width * s.height * (self.stride + 1) * size,
             f"the gradients of {self.count} billboards",
         )
         grad_alpha = torch.from_numpy(self._empty(self.count, self.texels, self.texels))
-        grad_features = torch.from_numpy(self._empty(*grad_alpha.shape, self.channels))
+        grad_features = torch.from_numpy(self._empty(*grad_alpha.shape, self.own))
+        grad_uniform = torch.from_numpy(self._empty(self.count, self.stride if self.uniform else 0))
         grad_plane = torch.empty(self.count, 3, 3, dtype=torch.float64)
         grad_fade = torch.empty(self.count, dtype=torch.float64)
         adjoints = Adjoints(self._rows(grad_image), grad_opacity.to(self.dtype).contiguous().view(-1).numpy())
-        flat = grad_features.view(-1).numpy(), grad_alpha.view(-1).numpy()
+        flat = (values.view(-1).numpy() for values in (grad_features, grad_alpha, grad_uniform))
         self._replay(adjoints, Gradients(*flat, grad_plane.numpy(), grad_fade.numpy()))
-        return grad_features, grad_alpha, grad_plane, grad_fade
+        return grad_features, grad_alpha, grad_uniform[:, self.own : self.channels], grad_plane, grad_fade
 
     def _rows(self, image: Tensor) -> np.ndarray:
         """An image (C, H, W) as (H, W, stride), flat."""
@@ -226,8 +242,9 @@ class _Scene:
         s = self.settings
         across = -(-s.width // binning.TILE_WIDTH)
         return Shape(
-            self.texels, self.channels, s.width, s.height, across, s.queue, sizes.capacity, sizes.rows, sizes.bundles
-        )
+            self.texels, self.own, self.uniform, s.width, s.height, across, s.queue, sizes.capacity, sizes.rows,
+            sizes.bundles,
+        )  # fmt: skip
 
     def _run(self, plan: _Pass, images: Images | None, backward: tuple[Adjoints, Tape] | None) -> list[np.ndarray]:
         """Runs the forward kernel, or with `backward` that of the replay, on all threads; returns each one's status."""
@@ -283,7 +300,7 @@ def prepare_kernels(dtype: torch.dtype) -> None:
 
     bins, constants = bins_type(real), constants_type(real)
     shape = group(Shape, *[i64] * len(Shape._fields))
-    textures, adjoints = group(Textures, reals, reals), group(Adjoints, reals, reals)
+    textures, adjoints = group(Textures, reals, reals, reals), group(Adjoints, reals, reals)
     tape = group(Tape, reals, i32s, i32s, i64s, i64)
     tiles = (
         i64s, i32s, bins, textures, constants, shape, group(Images, reals, reals, i64s), adjoints, tape,
@@ -303,7 +320,7 @@ def prepare_kernels(dtype: torch.dtype) -> None:
             cpu_gather.interleave: (i64s, i64, reals, reals, i64, i64),
             cpu_gather.gather_gradients: (
                 i64s, group(Part, i64, i64, i64, i64, boolean), bins, textures, constants, shape, adjoints, tape,
-                group(Gradients, reals, reals, array_of(f64, 3), array_of(f64)),
+                group(Gradients, reals, reals, reals, array_of(f64, 3), array_of(f64)),
                 scratch_type(GatherScratch, GATHER_BUFFERS, real),
             ),
         },

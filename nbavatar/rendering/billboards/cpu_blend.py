@@ -88,25 +88,25 @@ def blend(scene, scratch, replay, mask, first, transmittance, weight, hits):
 
 
 @inlined
-def _add_current(scene, scratch, hits, features):
+def _add_current(scene, scratch, hits, features, uniform):
     """Adds the hits of the current billboard to their pixels, each with its weight."""
     stride = scene.layout.stride
     for h in range(hits):
         lane, pixel = np.int64(get(scratch.hit_lane, h)), np.int64(get(scratch.hit_pixel, h))
         weight, colour = broadcast(get(scratch.weight, lane)), advance(scratch.colour, pixel * stride)
         if stride == LANES:  # the usual case: no loop
-            store(colour, 0, load(colour, 0) + weight * feature_of(scene, scratch, features, lane, 0))
+            store(colour, 0, load(colour, 0) + weight * feature_of(scene, scratch, features, uniform, lane, 0))
         else:
             for c in range(0, stride, LANES):
-                store(colour, c, load(colour, c) + weight * feature_of(scene, scratch, features, lane, c))
+                store(colour, c, load(colour, c) + weight * feature_of(scene, scratch, features, uniform, lane, c))
 
 
 @inlined
-def blend_unsorted(scene, scratch, replay, count, hits, features, bundles):
+def blend_unsorted(scene, scratch, replay, count, hits, features, uniform, bundles):
     """Blends the hits of the current billboard at once; returns the number of pixels that this has finished.
 
     Args:
-        count: of the billboard's packets; features: pointer to its texture; bundles: that the band had before.
+        count: of the billboard's packets; features, uniform: pointers to its own; bundles: that the band had before.
     """
     one, empty_key, finished = scene.lanes.one, scene.lanes.empty_key, 0
     for j in range(count):
@@ -125,7 +125,7 @@ def blend_unsorted(scene, scratch, replay, count, hits, features, bundles):
             transmittance = get(scratch.weight, np.int64(get(scratch.hit_lane, h)))
             record_hit(scratch, at + h, get(scratch.hit_pixel, h), bundles * LANES + h, transmittance)
     else:
-        _add_current(scene, scratch, hits, features)
+        _add_current(scene, scratch, hits, features, uniform)
     return finished
 
 
@@ -160,7 +160,7 @@ def write_band(scene, scratch, images, band, width, height):
     one, left, right = scene.lanes.one, band.left, band.right
     image, opacity = images.features, images.opacity
     area, stride = np.int64(width) * height, scene.layout.stride
-    if width % (2 * LANES) == 0 and area * scene.layout.channels >= LARGE:
+    if width % (2 * LANES) == 0 and area * scene.layout.image >= LARGE:
         # A large image is not in the caches when it is read: writing past them saves reading the memory first. The
         # second half of a line follows the first at once: few lines can be under way.
         for y in range(band.top, band.bottom):
@@ -169,10 +169,10 @@ def write_band(scene, scratch, images, band, width, height):
                 pixel = np.int64(y) * width + x
                 stream(opacity, pixel, one - load(scratch.transmittance, first))
                 stream(opacity, pixel + LANES, one - load(scratch.transmittance, first + LANES))
-                for c in range(0, scene.layout.channels, LANES):
+                for c in range(0, scene.layout.image, LANES):
                     here = _channels(scratch, first * stride + c, stride)
                     beside = _channels(scratch, (first + LANES) * stride + c, stride)
-                    for lane in range(min(LANES, scene.layout.channels - c)):
+                    for lane in range(min(LANES, scene.layout.image - c)):
                         stream(image, (c + lane) * area + pixel, here[lane])
                         stream(image, (c + lane) * area + pixel + LANES, beside[lane])
         return
@@ -182,7 +182,7 @@ def write_band(scene, scratch, images, band, width, height):
             first = (y - band.top) * TILE_WIDTH + x - left
             pixel = np.int64(y) * width + x
             masked_store(opacity, pixel, one - load(scratch.transmittance, first), used)
-            for c in range(0, scene.layout.channels, LANES):
+            for c in range(0, scene.layout.image, LANES):
                 channels = _channels(scratch, first * stride + c, stride)
-                for lane in range(min(LANES, scene.layout.channels - c)):
+                for lane in range(min(LANES, scene.layout.image - c)):
                     masked_store(image, (c + lane) * area + pixel, channels[lane], used)

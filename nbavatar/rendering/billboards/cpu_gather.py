@@ -51,7 +51,8 @@ GATHER_BUFFERS = (
     Buffer("texel", None, lambda n: LANES),  # numbers of the first texels, as floating-point numbers
     # of the current billboard
     Buffer("dL_dalpha", None, lambda n: n.texels**2),
-    Buffer("dL_dfeature", None, lambda n: n.texels**2 * -(-n.channels // LANES) * LANES),  # `stride` a texel
+    Buffer("dL_dfeature", None, lambda n: n.texels**2 * n.stride),  # whole vectors a texel
+    Buffer("dL_duniform", None, lambda n: n.stride),  # of all channels; the texture's own are not read
 )
 GatherScratch = namedtuple("GatherScratch", [buffer.name for buffer in GATHER_BUFFERS])
 
@@ -67,10 +68,14 @@ class Part(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Results: like the textures, flat; (F, 3, 3) and (F,) float64."""
+    """Results: like the textures, flat; (F, 3, 3) and (F,) float64.
+
+    Of the uniform channels' rows only those channels mean anything.
+    """
 
     features: Any
     alpha: Any
+    uniform: Any
     plane: Any
     fade: Any
 
@@ -120,16 +125,17 @@ def _add(totals, at, value):
 
 
 @inlined
-def _add_hits(word, scratch, adjoints, width, pixels, features, layout, zero):
-    """Adds the hits of a bundle with a bit in `word` to the texels' gradients, one after the other.
+def _add_hits(word, scratch, adjoints, width, pixels, features, uniform, layout, zero):
+    """Adds the hits of a bundle with a bit in `word` to the textures' gradients, one after the other.
 
     Args:
         adjoints: of the image's rows from the tile's first pixel on; width: of the image; pixels: the hits' places in
             the tile.
         scratch: `corner_weight`, `texel` given, `product` and the gradients are results.
-        features: pointer to the billboard's.
+        features, uniform: pointers to the billboard's.
     """
     channels, stride, right, below = layout.channels, layout.stride, layout.step, layout.step * layout.texels
+    kept = _whole(channels)
     alpha, product = scratch.dL_dalpha, scratch.product
     while word != 0:
         lane = count_trailing_zeros(word)
@@ -145,7 +151,7 @@ def _add_hits(word, scratch, adjoints, width, pixels, features, layout, zero):
         w00, w01 = broadcast(get(weight, 0)), broadcast(get(weight, LANES))
         w10, w11 = broadcast(get(weight, 2 * LANES)), broadcast(get(weight, 3 * LANES))
         d00, d01, d10, d11 = broadcast(zero), broadcast(zero), broadcast(zero), broadcast(zero)
-        source, totals = advance(features, texel * channels), advance(scratch.dL_dfeature, texel * stride)
+        source, totals = advance(features, texel * channels), advance(scratch.dL_dfeature, texel * kept)
         pixel = np.int64(get(pixels, lane))
         row = advance(adjoints, ((pixel >> ROW) * width + (pixel & COLUMN)) * stride)
         for c in range(0, channels, LANES):
@@ -156,9 +162,16 @@ def _add_hits(word, scratch, adjoints, width, pixels, features, layout, zero):
             d10 = d10 + dL_dcolour * masked_load(source, below * channels + c, used)
             d11 = d11 + dL_dcolour * masked_load(source, (below + right) * channels + c, used)
             _add(totals, c, dL_dcolour * w00)
-            _add(totals, right * stride + c, dL_dcolour * w01)
-            _add(totals, below * stride + c, dL_dcolour * w10)
-            _add(totals, (below + right) * stride + c, dL_dcolour * w11)
+            _add(totals, right * kept + c, dL_dcolour * w01)
+            _add(totals, below * kept + c, dL_dcolour * w10)
+            _add(totals, (below + right) * kept + c, dL_dcolour * w11)
+        if layout.image > channels:
+            inside, same = (w00 + w01) + (w10 + w11), broadcast(zero)
+            for c in range(channels // LANES * LANES, layout.image, LANES):
+                dL_dcolour = load(row, c)
+                same = same + dL_dcolour * load(uniform, c)
+                _add(scratch.dL_duniform, c, dL_dcolour * inside)
+            d00, d01, d10, d11 = d00 + same, d01 + same, d10 + same, d11 + same
         put(product, lane, sum_lanes(d00))
         put(product, LANES + lane, sum_lanes(d01))
         put(product, 2 * LANES + lane, sum_lanes(d10))
@@ -166,18 +179,28 @@ def _add_hits(word, scratch, adjoints, width, pixels, features, layout, zero):
 
 
 @inlined
-def _hand_over(scratch, features, alpha, layout, fresh):
+def _whole(channels):
+    """Channels filled up to whole vectors."""
+    return (channels + LANES - 1) // LANES * LANES
+
+
+@inlined
+def _hand_over(scratch, features, alpha, uniform, layout, fresh):
     """Copies a billboard's sums to the results, or adds them."""
-    channels, stride = layout.channels, layout.stride
+    channels, kept = layout.channels, _whole(layout.channels)
     for texel in range(layout.texels * layout.texels):
         for c in range(0, channels, LANES):
             used = first_lanes(channels - c)
-            value = load(scratch.dL_dfeature, texel * stride + c)
+            value = load(scratch.dL_dfeature, texel * kept + c)
             if not fresh:
                 value = value + masked_load(features, texel * channels + c, used)
             masked_store(features, texel * channels + c, value, used)
         value = get(scratch.dL_dalpha, texel)
         put(alpha, texel, value if fresh else get(alpha, texel) + value)
+    if layout.image > channels:
+        for c in range(0, layout.stride, LANES):
+            value = load(scratch.dL_duniform, c)
+            store(uniform, c, value if fresh else load(uniform, c) + value)
 
 
 @kernel
@@ -200,7 +223,8 @@ def gather_gradients(counter, part, bins, textures_, constants, shape, adjoints_
     tile_bundle = tape_.tile_bundle
     lanes = broadcast_constants(constants)
     zero, zeros = constants.zero, lanes.zero
-    layout = Layout(texels, min(1, texels - 1), shape.channels, (shape.channels + LANES - 1) // LANES * LANES)
+    image_channels = shape.channels + shape.uniform
+    layout = Layout(texels, min(1, texels - 1), shape.channels, image_channels, _whole(image_channels))
     area, step, size = texels * texels, layout.step, textures_.alpha.itemsize
     scale = 0.5 * (texels - 1) if texels > 1 else 1.0
     middle = broadcast(zero + np.float32(0.5 * (texels - 1)))  # of a texture: where its plane's coordinates are 0
@@ -248,8 +272,10 @@ def gather_gradients(counter, part, bins, textures_, constants, shape, adjoints_
                             used = True
                             for j in range(area):
                                 put(scratch.dL_dalpha, j, zero)
-                            for j in range(area * layout.stride):
+                            for j in range(area * _whole(shape.channels)):
                                 put(scratch.dL_dfeature, j, zero)
+                            for j in range(layout.stride):
+                                put(scratch.dL_duniform, j, zero)
                         pixel = load(tape.pixels, LANES * bundle)
                         dx = to_real((pixel & broadcast(np.int32(COLUMN))) + broadcast(np.int32(left - x_origin)), zero)
                         dy = to_real((pixel >> broadcast(np.int32(ROW))) + broadcast(np.int32(top - y_origin)), zero)
@@ -276,7 +302,8 @@ def gather_gradients(counter, part, bins, textures_, constants, shape, adjoints_
                         store(scratch.texel, 0, foot.row * broadcast(zero + np.float32(texels)) + foot.column)
                         _add_hits(
                             mask_bits(hit_mask), scratch, tile_adjoints, width, advance(tape.pixels, LANES * bundle),
-                            advance(textures.features, i * area * shape.channels), layout, zero,
+                            advance(textures.features, i * area * shape.channels),
+                            advance(textures.uniform, i * layout.stride), layout, zero,
                         )  # fmt: skip
                         d00, d01 = load(scratch.product, 0), load(scratch.product, LANES)
                         d10, d11 = load(scratch.product, 2 * LANES), load(scratch.product, 3 * LANES)
@@ -290,17 +317,21 @@ def gather_gradients(counter, part, bins, textures_, constants, shape, adjoints_
                         w_x, w_y, w_1 = w_x + dL_dpw * dx, w_y + dL_dpw * dy, w_1 + dL_dpw
             grad_features = advance(gradients.features, i * area * shape.channels)
             grad_alpha = advance(gradients.alpha, i * area)
+            grad_uniform = advance(gradients.uniform, i * layout.stride)
             if part.fresh:
                 for j in range(9):
                     grad_plane[i, j // 3, j % 3] = 0.0
                 grad_fade[i] = 0.0
             if used:
-                _hand_over(scratch, grad_features, grad_alpha, layout, part.fresh)
+                _hand_over(scratch, grad_features, grad_alpha, grad_uniform, layout, part.fresh)
             elif part.fresh:
                 for j in range(area * shape.channels):
                     put(grad_features, j, zero)
                 for j in range(area):
                     put(grad_alpha, j, zero)
+                if layout.image > shape.channels:
+                    for j in range(layout.stride):
+                        put(grad_uniform, j, zero)
             if not used:
                 continue
             # from texel coordinates about the record's origin to texture coordinates about the image's

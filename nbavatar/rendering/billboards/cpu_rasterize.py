@@ -139,27 +139,32 @@ def list_hits(scene, scratch, record, alpha, count):
 
 
 @inlined
-def feature_of(scene, scratch, features, lane, c):
-    """Features from channel c on under a lane of the packets; `features`: pointer to the billboard's."""
+def feature_of(scene, scratch, features, uniform, lane, c):
+    """Features from channel c on under a lane of the packets; `features`, `uniform`: pointers to the billboard's."""
     layout = scene.layout
-    used = first_lanes(layout.channels - c)
-    right, below = layout.step * layout.channels, layout.step * layout.texels * layout.channels
-    texel = advance(features, np.int64(get(scratch.texel, lane)) * layout.channels + c)
     weight = advance(scratch.corner_weight, lane)
-    above = masked_load(texel, 0, used) * broadcast(get(weight, 0))
-    above = above + masked_load(texel, right, used) * broadcast(get(weight, CORNER))
-    under = masked_load(texel, below, used) * broadcast(get(weight, 2 * CORNER))
-    return above + (under + masked_load(texel, right + below, used) * broadcast(get(weight, 3 * CORNER)))
+    w00, w01 = broadcast(get(weight, 0)), broadcast(get(weight, CORNER))
+    w10, w11 = broadcast(get(weight, 2 * CORNER)), broadcast(get(weight, 3 * CORNER))
+    feature = scene.lanes.zero
+    if c < layout.channels:
+        used = first_lanes(layout.channels - c)
+        right, below = layout.step * layout.channels, layout.step * layout.texels * layout.channels
+        texel = advance(features, np.int64(get(scratch.texel, lane)) * layout.channels + c)
+        above = masked_load(texel, 0, used) * w00 + masked_load(texel, right, used) * w01
+        feature = above + (masked_load(texel, below, used) * w10 + masked_load(texel, right + below, used) * w11)
+    if layout.image > layout.channels:
+        feature = feature + load(uniform, c) * ((w00 + w01) + (w10 + w11))
+    return feature
 
 
 @inlined
-def sample_features(scene, scratch, features, hits, rows):
+def sample_features(scene, scratch, features, uniform, hits, rows):
     """Writes the features of the listed hits to `rows`, `stride` numbers for each."""
     stride = scene.layout.stride
     for h in range(hits):
         lane, row = np.int64(get(scratch.hit_lane, h)), advance(rows, h * stride)
         if stride == LANES:  # the usual case: no loop
-            store(row, 0, feature_of(scene, scratch, features, lane, 0))
+            store(row, 0, feature_of(scene, scratch, features, uniform, lane, 0))
         else:
             for c in range(0, stride, LANES):
-                store(row, c, feature_of(scene, scratch, features, lane, c))
+                store(row, c, feature_of(scene, scratch, features, uniform, lane, c))

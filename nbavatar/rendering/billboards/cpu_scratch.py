@@ -31,7 +31,7 @@ class Sizes(NamedTuple):
 
     rows: int  # of a band
     capacity: int  # hits that a pixel's queue holds
-    channels: int
+    channels: int  # of the image
     bundles: int  # of a band
     texels: int  # a side of a texture
 
@@ -101,7 +101,8 @@ class Shape(NamedTuple):
     """Whole numbers that the kernels of tiles take."""
 
     texels: Any  # a side
-    channels: Any
+    channels: Any  # of a texture
+    uniform: Any  # further channels, which all texels of a billboard have in common
     width: Any  # of the image [px]
     height: Any
     across: Any  # tiles side by side
@@ -112,10 +113,15 @@ class Shape(NamedTuple):
 
 
 class Textures(NamedTuple):
-    """Textures of all billboards, flat."""
+    """Textures of all billboards, flat, and what their texels have in common.
+
+    The latter lies where it is in a row of the image's channels, (F, stride), between zeros; without elements where
+    there is none.
+    """
 
     features: Any
     alpha: Any
+    uniform: Any
 
 
 class Images(NamedTuple):
@@ -154,6 +160,7 @@ class Layout(NamedTuple):
     texels: Any  # a side
     step: Any  # min(1, texels - 1): from a texel to the next
     channels: Any
+    image: Any  # channels of the image: those of the texture, and behind them the uniform ones
     stride: Any  # see `Sizes`
 
 
@@ -182,6 +189,7 @@ class Scene(NamedTuple):
     """What stays the same for all tiles."""
 
     features: Any  # textures
+    uniform: Any
     layout: Any
     constants: Any  # `cpu_intersection.Constants`
     lanes: Any  # the same in all lanes

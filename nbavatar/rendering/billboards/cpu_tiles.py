@@ -88,10 +88,12 @@ def _build(replay):
         box, tile_start, packed = bins.box, bins.tile_start, pointers(bins)
         members, record, rank = packed.members, packed.record, packed.rank
         textures, scratch, tape = pointers(textures_), pointers(scratch_), pointers(tape_)
-        stride = (shape.channels + LANES - 1) // LANES * LANES
+        image_channels = shape.channels + shape.uniform
+        stride = (image_channels + LANES - 1) // LANES * LANES
         pixels = TILE_WIDTH * rows + LANES
         scene = Scene(
-            textures.features, Layout(texels, min(1, texels - 1), shape.channels, stride), constants,
+            textures.features, textures.uniform,
+            Layout(texels, min(1, texels - 1), shape.channels, image_channels, stride), constants,
             broadcast_constants(constants), pixels, shape.bundles * LANES, pointers(adjoints_), tape,
             pointer(status, 0),
         )  # fmt: skip
@@ -141,6 +143,7 @@ def _build(replay):
                             prefetch(textures.alpha, np.int64(get(members, entry + 1)) * texels * texels + j)
                     texture, own = np.int64(i) * texels * texels, advance(record, i * RECORD)
                     features = advance(textures.features, texture * shape.channels)
+                    uniform = advance(textures.uniform, np.int64(i) * stride)
                     count = list_packets(scene, scratch, own, extent)
                     intersect_packets(scene, scratch, own, features, count, extent)
                     hits, broken = list_hits(scene, scratch, own, advance(textures.alpha, texture), count)
@@ -153,7 +156,7 @@ def _build(replay):
                     for bundle in range(bundles, bundles + more):
                         put(scratch.bundle_rank, bundle, get(rank, i))
                     if replay:
-                        sample_features(scene, scratch, features, more * LANES, scratch.hit_feature)
+                        sample_features(scene, scratch, features, uniform, more * LANES, scratch.hit_feature)
                         record_weight_adjoints(scene, scratch, hits, bundles, band, width)
                         record_pixels(scene, scratch, hits, taped + bundles, top - tile_top)
                         at = 2 * ((top - tile_top) // rows * len(bins.members) + entry)
@@ -161,7 +164,7 @@ def _build(replay):
                         put(tape.ranges, at + 1, total + bundles + more)
                     elif queue != 0:
                         row = advance(scratch.feature, bundles * LANES * stride)
-                        sample_features(scene, scratch, features, hits, row)
+                        sample_features(scene, scratch, features, uniform, hits, row)
                     if queue < 0:
                         level = max(level, enqueue(scene, scratch, hits, bundles))
                         waiting += hits
@@ -169,7 +172,7 @@ def _build(replay):
                         active -= enqueue_and_blend(scene, scratch, replay, hits, bundles, queue)
                         level = queue
                     else:
-                        active -= blend_unsorted(scene, scratch, replay, count, hits, features, bundles)
+                        active -= blend_unsorted(scene, scratch, replay, count, hits, features, uniform, bundles)
                     bundles += more
                 if overflow:
                     break

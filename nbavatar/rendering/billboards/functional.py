@@ -20,7 +20,7 @@ __all__ = ["render_billboards"]
 _WHERE = "render_billboards"
 _BACKENDS = ("auto", "reference", "cpu", "cuda")
 _Project = Callable[..., ProjectedPatches]
-_Blend = Callable[[ProjectedPatches, Tensor, Tensor, Tensor, BlendSettings], tuple[Tensor, Tensor]]
+_Blend = Callable[[ProjectedPatches, Tensor, Tensor, Tensor, BlendSettings, Tensor], tuple[Tensor, Tensor]]
 
 
 def render_billboards(
@@ -41,6 +41,7 @@ def render_billboards(
     t_min: float = 1e-4,
     low_pass: float = 1.0,
     backend: str = "auto",
+    uniform: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Renders textured billboards, front to back, differentiably.
 
@@ -76,10 +77,12 @@ def render_billboards(
             and dimmed so that its alpha summed over the image stays; 0 turns this off.
         backend: `auto` takes the kernels for the tensors' device; `reference` is the slow oracle, which also stands in,
             and says so, on a GPU for which no kernel can be compiled.
+        uniform: (F, D), further features that all texels of a billboard have in common, or None. As if they
+            stood behind the C of `features` in every texel, which on a CPU they need not.
 
     Returns:
-        Premultiplied features (C, H, W) and alpha (H, W), each with a leading B where `viewmat` or
-        `K` has one; dtype of `alpha`. Gradients reach means, quats, half_extents, features, alpha.
+        Premultiplied features (C + D, H, W) and alpha (H, W), each with a leading B where `viewmat` or
+        `K` has one; dtype of `alpha`. Gradients reach means, quats, half_extents, features, alpha, uniform.
 
     Raises:
         DataError: a shape, dtype, device, option or value is wrong; one line says which.
@@ -89,7 +92,8 @@ def render_billboards(
     if features is None and isinstance(alpha, Tensor):
         features = alpha.new_zeros(*alpha.shape, 0)
     assert features is not None
-    _check_tensors(means, quats, half_extents, features, alpha, viewmat, K)
+    uniform = features.new_zeros((len(features), 0)) if uniform is None else uniform
+    _check_tensors(means, quats, half_extents, features, alpha, viewmat, K, uniform)
     _check_options(width, height, near, alpha_min, alpha_max, t_min, low_pass)
     queue = parse_order(order)
     project, blend = _backend(backend, means.device)
@@ -102,8 +106,8 @@ def render_billboards(
         projection = project(
             means, quats, half_extents, view, intrinsic, near=near, low_pass=low_pass, support=settings.support
         )
-        rank = canonical_rank(projection.depth, means, quats, half_extents, features, alpha)
-        image, opacity = blend(projection, rank, features, alpha, settings)
+        rank = canonical_rank(projection.depth, means, quats, half_extents, features, alpha, uniform)
+        image, opacity = blend(projection, rank, features, alpha, settings, uniform)
         images.append((image.to(alpha.dtype), opacity.to(alpha.dtype)))
     if not batched:
         return images[0]
@@ -122,7 +126,7 @@ def _backend(name: str, device: torch.device) -> tuple[_Project, _Blend]:
     if name == "auto":
         name = "cpu" if device.type == "cpu" else "reference"
     if name == "reference":
-        return project_billboards, blend_reference
+        return project_billboards, _in_texels(blend_reference)
     if name == "cpu" and device.type == "cpu":
         from nbavatar.rendering.billboards.cpu import blend_cpu  # Numba is loaded only when it is needed
         from nbavatar.rendering.billboards.cpu_projection import project_billboards_cpu
@@ -131,16 +135,36 @@ def _backend(name: str, device: torch.device) -> tuple[_Project, _Blend]:
     if name == "cuda" and (device.type == "cuda" or os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"):
         from nbavatar.rendering.billboards.cuda import blend_cuda  # a machine without CUDA never gets here
 
-        return project_billboards, blend_cuda
+        return project_billboards, _in_texels(blend_cuda)
     raise DeviceError.of(_WHERE, "backend", expected=f"tensors on {name}", found=f"tensors on {device.type}")
 
 
+def _in_texels(blend: Callable[..., tuple[Tensor, Tensor]]) -> _Blend:
+    """Blending that knows textures only: what the texels of a billboard have in common is written to each."""
+
+    def blend_all(
+        projection: ProjectedPatches,
+        rank: Tensor,
+        features: Tensor,
+        alpha: Tensor,
+        settings: BlendSettings,
+        uniform: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        if uniform.shape[-1]:
+            repeated = uniform.to(features.dtype)[:, None, None].expand(*alpha.shape, -1)
+            features = torch.cat((features, repeated), dim=-1)
+        return blend(projection, rank, features, alpha, settings)
+
+    return blend_all
+
+
 def _check_tensors(
-    means: Tensor, quats: Tensor, half_extents: Tensor, features: Tensor, alpha: Tensor, viewmat: Tensor, K: Tensor
-) -> None:
+    means: Tensor, quats: Tensor, half_extents: Tensor, features: Tensor, alpha: Tensor, viewmat: Tensor, K: Tensor,
+    uniform: Tensor,
+) -> None:  # fmt: skip
     named = {
         "means": means, "quats": quats, "half_extents": half_extents, "features": features, "alpha": alpha,
-        "viewmat": viewmat, "K": K,
+        "viewmat": viewmat, "K": K, "uniform": uniform,
     }  # fmt: skip
     for name, value in named.items():
         if not isinstance(value, Tensor) or not value.is_floating_point():
@@ -157,6 +181,7 @@ def _check_tensors(
         raise DataError.of(_WHERE, "alpha", expected="at least one texel a side", found=f"shape {tuple(alpha.shape)}")
     channels = features.shape[-1] if features.ndim == 4 else -1
     _check_shape("features", features, (count, texels, texels, channels))
+    _check_shape("uniform", uniform, (count, uniform.shape[-1] if uniform.ndim == 2 else -1))
     for name, value, side in (("viewmat", viewmat, 4), ("K", K, 3)):
         if value.ndim not in (2, 3) or value.shape[-2:] != (side, side) or value.shape[0] == 0:
             raise DataError.of(_WHERE, name, expected=f"({side}, {side}) or (B, {side}, {side})",

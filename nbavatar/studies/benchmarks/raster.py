@@ -36,7 +36,7 @@ from nbavatar.studies.benchmarks.raster_scene import RasterScene, make_scene
 
 __all__ = ["add_arguments", "run"]
 
-_OPTIONS = {"near": 0.01, "alpha_min": 1.0 / 255.0, "alpha_max": 0.99, "t_min": 1e-4}
+_OPTIONS: dict[str, Any] = {"near": 0.01, "alpha_min": 1.0 / 255.0, "alpha_max": 0.99, "t_min": 1e-4}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -146,15 +146,16 @@ def _parts(scene: StepScene, crop: int) -> dict[str, Callable[[], None]]:
     view, K = sample.view.viewmat.to(device), sample.K.to(device)
     posed, _ = avatar.pose(verts, FRAME)
     textures, cover = avatar.textures()
-    drawn = avatar.drawn(textures, posed, view)
-    fixed = [value.detach().requires_grad_(True) for value in (*posed.planes, drawn, cover)]
+    fixed = [value.detach().requires_grad_(True) for value in (*posed.planes, textures, cover)]
+    told = avatar.told(posed, view).detach()
     region = full_region(side, side, avatar.multiple)
     stored = (sample.pixels.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
 
     def raster() -> tuple[Tensor, Tensor]:
         return render_billboards(
-            *fixed, view, shift_camera(K, region), region.width, region.height, order=avatar.architecture.order
-        )
+            *fixed, view, shift_camera(K, region), region.width, region.height, order=avatar.architecture.order,
+            uniform=told,
+        )  # fmt: skip
 
     features, alpha = (value.detach().requires_grad_(True) for value in raster())
     image = torch.rand((1, 3, crop, crop), device=device, requires_grad=True)

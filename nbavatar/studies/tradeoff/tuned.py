@@ -285,11 +285,10 @@ class TunedAvatar:
         self.work.raster_calls += 1
         self.work.raster_pixels += region.width * region.height
         self.work.texels += alpha.numel()
-        drawn = scene.avatar.drawn(features, posed, viewmat)
         return render_billboards(
-            *posed.planes, drawn, alpha, viewmat, shift_camera(K, region), region.width, region.height,
+            *posed.planes, features, alpha, viewmat, shift_camera(K, region), region.width, region.height,
             order=s.order or scene.avatar.architecture.order, alpha_min=s.alpha_min, t_min=s.t_min,
-            low_pass=s.low_pass,
+            low_pass=s.low_pass, uniform=scene.avatar.told(posed, viewmat),
         )  # fmt: skip
 
     def _decode(self, features: Tensor, nb_alpha: Tensor) -> tuple[Tensor, Tensor]:

@@ -75,13 +75,14 @@ def plain_bins(projection, texels, order, rank):
     )  # fmt: skip
 
 
-def scene_of(projection, features, alpha, s, rank=None):
+def scene_of(projection, features, alpha, s, rank=None, uniform=None):
     """The CPU backend's scene on plain bins, in float64."""
+    uniform = alpha.new_zeros((len(alpha), 0)) if uniform is None else uniform
     rank = np.argsort(projection.depth.numpy(), kind="stable") if rank is None else np.asarray(rank)
     order = rank[np.argsort(projection.nearest.numpy()[rank], kind="stable")] if s.queue < 0 else rank
     bins = plain_bins(projection, alpha.shape[-1], order, rank)
     with mock.patch.object(cpu, "bin_billboards", lambda *_, **__: bins):
-        return cpu._Scene(projection, torch.from_numpy(rank), features, alpha, s)
+        return cpu._Scene(projection, torch.from_numpy(rank), features, alpha, uniform, s)
 
 
 def replayed(scene, grad_image, grad_opacity):

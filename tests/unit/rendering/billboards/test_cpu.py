@@ -18,13 +18,18 @@ from nbavatar.rendering.ordering import canonical_rank, parse_order
 from tests.unit.rendering.billboards.scenes import OPTIONS, camera, facing, random_billboards, stack
 
 
-def compare(scene, view, K, width, height, *, value=2e-5, gradient=1e-4, most_flips=0.02, **options):
+def compare(scene, view, K, width, height, *, value=2e-5, gradient=1e-4, most_flips=0.02, uniform=None, **options):
     """Asserts that values and gradients equal the float64 reference's, off the pixels where a decision may flip."""
     options = {**OPTIONS, "order": "ray", **options}
     inputs = [tensor.detach().clone().requires_grad_() for tensor in scene]
     wide = [tensor.detach().double().requires_grad_() for tensor in scene]
-    image, opacity = render_billboards(*inputs, view, K, width, height, backend="cpu", **options)
-    expected, expected_opacity = render_billboards(*wide, view, K, width, height, backend="reference", **options)
+    beside, beside_wide = None, None
+    if uniform is not None:
+        beside, beside_wide = uniform.clone().requires_grad_(), uniform.double().requires_grad_()
+    image, opacity = render_billboards(*inputs, view, K, width, height, backend="cpu", uniform=beside, **options)
+    expected, expected_opacity = render_billboards(
+        *wide, view, K, width, height, backend="reference", uniform=beside_wide, **options
+    )
     support = texture_support(scene[4].shape[-1])
     with torch.no_grad():
         projection = project_billboards(
@@ -36,7 +41,7 @@ def compare(scene, view, K, width, height, *, value=2e-5, gradient=1e-4, most_fl
         tolerance = 1e-5 if image.dtype == torch.float32 else 1e-10
         safe = ~critical_pixels(projection, rank, wide[4], blend, tolerance=tolerance)
     assert bool(torch.isfinite(image).all()) and bool(torch.isfinite(opacity).all())
-    scale = max(1.0, float(scene[3].abs().max()))
+    scale = max(1.0, float(scene[3].abs().max()) if scene[3].numel() else 0.0)
     with torch.no_grad():
         wrong = (opacity - expected_opacity).abs() > value
         wrong |= ((image - expected).abs() > value * scale).any(0)
@@ -46,7 +51,10 @@ def compare(scene, view, K, width, height, *, value=2e-5, gradient=1e-4, most_fl
     grads = [torch.randn(tensor.shape, generator=g, dtype=torch.float64) * safe for tensor in (image, opacity)]
     torch.autograd.backward((image, opacity), [grad.to(image.dtype) for grad in grads])
     torch.autograd.backward((expected, expected_opacity), grads)
-    for name, got, want in zip(("means", "quats", "half_extents", "features", "alpha"), inputs, wide, strict=True):
+    names = ["means", "quats", "half_extents", "features", "alpha"]
+    if uniform is not None:
+        names, inputs, wide = [*names, "uniform"], [*inputs, beside], [*wide, beside_wide]
+    for name, got, want in zip(names, inputs, wide, strict=True):
         assert bool(torch.isfinite(got.grad).all()), name
         error = float((got.grad.double() - want.grad).norm())
         assert error <= gradient * float(want.grad.norm()) + 1e-9, (name, error, float(want.grad.norm()))
@@ -59,6 +67,22 @@ def test_equals_the_reference(order, texels, channels):
     scene = random_billboards(5, 40, texels, channels, torch.float32)
     view, K = camera(53, 37)  # no multiple of a tile
     compare(scene, view, K, 53, 37, order=order)
+
+
+@pytest.mark.parametrize("order", ["ray", "center", "kbuffer(4)"])
+@pytest.mark.parametrize(("texels", "channels", "uniform"), [(6, 6, 7), (2, 8, 3), (1, 3, 14), (3, 0, 2), (4, 17, 1)])
+def test_channels_that_texels_have_in_common_equal_the_references(order, texels, channels, uniform):
+    """The reference has them in every texel, which fade to zero at the texture's border as others do."""
+    scene = random_billboards(5, 40, texels, channels, torch.float32)
+    told = torch.randn(40, uniform, generator=torch.Generator().manual_seed(1))
+    compare(scene, *camera(53, 37), 53, 37, order=order, uniform=told)
+
+
+def test_gradients_of_many_tapes_add_up_for_uniform_channels_too(monkeypatch):
+    scene = random_billboards(6, 60, 4, 3)
+    told = torch.randn(60, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    monkeypatch.setattr(cpu, "_TAPE", 20)
+    compare(scene, *camera(90, 70), 90, 70, value=1e-12, gradient=1e-12, uniform=told)
 
 
 def test_float64_equals_the_reference_to_the_last_digits():

@@ -47,15 +47,18 @@ def random_tape(seed, scene, seen):
     return tape, [torch.tensor([row[1:] for row in sorted(rows)]).double().reshape(-1, 2) for rows in numbers]
 
 
-@pytest.mark.parametrize(("texels", "channels"), [(1, 2), (2, 3), (5, 10)])
-def test_gradients_of_textures_planes_and_fades(texels, channels):
+@pytest.mark.parametrize(("texels", "channels", "uniform"), [(1, 2, 0), (2, 3, 0), (5, 10, 0), (1, 2, 7), (5, 8, 3)])
+def test_gradients_of_textures_planes_and_fades(texels, channels, uniform):
     """L = sum over hits of w (f . dL/dC) + dL/da a, with the tape's w and dL/da as constants."""
     count, s = 5, settings(0, texels, alpha_max=0.6)
     projection = patches(7, count, radius=(4.0, 15.0), tilt=0.02)
     features, alpha = textures(7, count, texels, channels)
-    scene = scene_of(projection, features, alpha, s)
-    grad_image = torch.randn(channels, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
-    leaves = [t.clone().requires_grad_() for t in (features, alpha, projection.plane, projection.fade)]
+    told = torch.randn(count, uniform, generator=torch.Generator().manual_seed(10), dtype=torch.float64)
+    scene = scene_of(projection, features, alpha, s, uniform=told)
+    grad_image = torch.randn(
+        channels + uniform, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(8), dtype=torch.float64
+    )
+    leaves = [t.clone().requires_grad_() for t in (features, alpha, projection.plane, projection.fade, told)]
     points = torch.tensor([(x + 0.5, y + 0.5, 1.0) for x, y in pixels()]).double()
     inside = (projection.plane.detach() @ points.T).permute(0, 2, 1)
     covered = (inside[..., :2].abs() < 0.999 * s.support * inside[..., 2:]).all(-1)
@@ -65,14 +68,17 @@ def test_gradients_of_textures_planes_and_fades(texels, channels):
         u, v, w = (leaves[2][i] @ points[covered[i]].T).unbind(0)
         raw = leaves[3][i] * sampled(leaves[1][i, ..., None], u / w, v / w)[:, 0]
         a = torch.where(raw <= s.alpha_max, raw, s.alpha_max)
-        feature = sampled(leaves[0][i], u / w, v / w)
-        dL_dcolour = grad_image.reshape(channels, -1).T[covered[i]]
+        everywhere = torch.cat((leaves[0][i], leaves[4][i].expand(texels, texels, -1)), -1)
+        feature = sampled(everywhere, u / w, v / w)
+        dL_dcolour = grad_image.reshape(channels + uniform, -1).T[covered[i]]
         loss = loss + (numbers[i][:, 0] * (feature * dL_dcolour).sum(-1)).sum() + (numbers[i][:, 1] * a).sum()
     expected = torch.autograd.grad(loss, leaves)
     found = [torch.full_like(leaf, torch.nan).detach() for leaf in leaves]  # uninitialised memory
-    flat = Gradients(found[0].view(-1).numpy(), found[1].view(-1).numpy(), found[2].numpy(), found[3].numpy())
+    rows = torch.full((count, scene.stride), torch.nan, dtype=torch.float64)
+    flat = Gradients(*(values.view(-1).numpy() for values in (*found[:2], rows)), found[2].numpy(), found[3].numpy())
     adjoints = Adjoints(scene._rows(grad_image), np.zeros(WIDTH * HEIGHT))
     scene._gather(Part(2, 0, 3, 1, True), adjoints, tape, flat)  # in two parts: the second adds to the first
     scene._gather(Part(2, 3, 4, 1, False), adjoints, tape, flat)
-    for name, a, b in zip(("features", "alpha", "plane", "fade"), found, expected, strict=True):
+    found[4] = rows[:, channels : channels + uniform]
+    for name, a, b in zip(("features", "alpha", "plane", "fade", "uniform"), found, expected, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9, msg=name)
