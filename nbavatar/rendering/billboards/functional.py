@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -126,7 +127,7 @@ def _backend(name: str, device: torch.device) -> tuple[_Project, _Blend]:
     if name == "auto":
         name = "cpu" if device.type == "cpu" else "reference"
     if name == "reference":
-        return project_billboards, _in_texels(blend_reference)
+        return project_billboards, partial(_in_texels, blend_reference)
     if name == "cpu" and device.type == "cpu":
         from nbavatar.rendering.billboards.cpu import blend_cpu  # Numba is loaded only when it is needed
         from nbavatar.rendering.billboards.cpu_projection import project_billboards_cpu
@@ -135,27 +136,24 @@ def _backend(name: str, device: torch.device) -> tuple[_Project, _Blend]:
     if name == "cuda" and (device.type == "cuda" or os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"):
         from nbavatar.rendering.billboards.cuda import blend_cuda  # a machine without CUDA never gets here
 
-        return project_billboards, _in_texels(blend_cuda)
+        return project_billboards, partial(_in_texels, blend_cuda)
     raise DeviceError.of(_WHERE, "backend", expected=f"tensors on {name}", found=f"tensors on {device.type}")
 
 
-def _in_texels(blend: Callable[..., tuple[Tensor, Tensor]]) -> _Blend:
+def _in_texels(
+    blend: Callable[..., tuple[Tensor, Tensor]],
+    projection: ProjectedPatches,
+    rank: Tensor,
+    features: Tensor,
+    alpha: Tensor,
+    settings: BlendSettings,
+    uniform: Tensor,
+) -> tuple[Tensor, Tensor]:
     """Blending that knows textures only: what the texels of a billboard have in common is written to each."""
-
-    def blend_all(
-        projection: ProjectedPatches,
-        rank: Tensor,
-        features: Tensor,
-        alpha: Tensor,
-        settings: BlendSettings,
-        uniform: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        if uniform.shape[-1]:
-            repeated = uniform.to(features.dtype)[:, None, None].expand(*alpha.shape, -1)
-            features = torch.cat((features, repeated), dim=-1)
-        return blend(projection, rank, features, alpha, settings)
-
-    return blend_all
+    if uniform.shape[-1]:
+        repeated = uniform.to(features.dtype)[:, None, None].expand(*alpha.shape, -1)
+        features = torch.cat((features, repeated), dim=-1)
+    return blend(projection, rank, features, alpha, settings)
 
 
 def _check_tensors(
