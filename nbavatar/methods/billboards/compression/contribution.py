@@ -27,13 +27,15 @@ def contributions(
         viewmat: world to camera (4, 4); K: intrinsics (3, 3) [px]; width, height: picture [px].
         order: compositing order.
     """
-    ones = torch.ones(*alpha.shape, 1, dtype=alpha.dtype, device=alpha.device, requires_grad=True)
+    ones = torch.ones(len(alpha), 1, dtype=alpha.dtype, device=alpha.device, requires_grad=True)
     tensors = [tensor.detach() for tensor in (*posed.planes, alpha, viewmat, K)]
     means, quats, half_extents, alpha, viewmat, K = tensors
     with torch.enable_grad():
-        image, _ = render_billboards(means, quats, half_extents, ones, alpha, viewmat, K, width, height, order=order)
+        image, _ = render_billboards(
+            means, quats, half_extents, None, alpha, viewmat, K, width, height, order=order, uniform=ones
+        )
         (gradient,) = torch.autograd.grad(image.sum(), ones)
-    return gradient.sum((1, 2, 3))
+    return gradient[:, 0]
 
 
 def most_contributing(views: Iterable[Tensor], share: float) -> Tensor:
