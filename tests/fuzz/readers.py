@@ -30,12 +30,15 @@ class Reader:
         kind: how it is damaged (`tests.fuzz.mutations`).
         refuses: whether damage is refused; damaged lines of a log are skipped, and the key of a training that is
             another one moves its folder aside.
+        heavy: whether a file takes tens of milliseconds, because YAML is parsed in Python, whole tables are built of
+            what was read, or a body model is loaded beside it; a tenth of the files has to do for it in the tests.
     """
 
     write: Callable[[Path], Path]
     read: Callable[[Path], Any]
     kind: str
     refuses: bool = True
+    heavy: bool = False
 
 
 def _arrays(path: Path) -> None:
@@ -379,14 +382,14 @@ READERS = {
     "captures of a run": Reader(lambda d: seeds.capture(d, "cameras.json"), _captures, "json"),
     "subjects.tsv": Reader(lambda d: seeds.config(d, "subjects.tsv"), _subjects, "text"),
     "runs.tsv": Reader(lambda d: seeds.config(d, "runs.tsv"), _rows, "text"),
-    "tables.yaml": Reader(lambda d: seeds.config(d, "tables.yaml", 2), _tables, "text"),
-    "figures.yaml": Reader(lambda d: seeds.config(d, "figures.yaml"), _figures, "text"),
-    "run.yaml": Reader(lambda d: seeds.config(d, "smoke.yaml"), _run, "text"),
-    "tradeoff.yaml": Reader(lambda d: seeds.config(d, "tradeoff.yaml"), _sheet, "text"),
+    "tables.yaml": Reader(lambda d: seeds.config(d, "tables.yaml", 2), _tables, "text", heavy=True),
+    "figures.yaml": Reader(lambda d: seeds.config(d, "figures.yaml"), _figures, "text", heavy=True),
+    "run.yaml": Reader(lambda d: seeds.config(d, "smoke.yaml"), _run, "text", heavy=True),
+    "tradeoff.yaml": Reader(lambda d: seeds.config(d, "tradeoff.yaml"), _sheet, "text", heavy=True),
     "options.json": Reader(seeds.options, _options, "json"),
-    "reported.csv": Reader(lambda d: seeds.config(d, "reported.csv"), _printed, "text"),
-    "evaluation for a table": Reader(seeds.evaluation_file, _table, "json"),
-    "timing for a table": Reader(seeds.timing_file, _table, "json"),
+    "reported.csv": Reader(lambda d: seeds.config(d, "reported.csv"), _printed, "text", heavy=True),
+    "evaluation for a table": Reader(seeds.evaluation_file, _table, "json", heavy=True),
+    "timing for a table": Reader(seeds.timing_file, _table, "json", heavy=True),
     "evaluation for a report": Reader(seeds.evaluation_file, _report, "json"),
     "timing for a report": Reader(seeds.timing_file, _speeds, "json"),
     "history.jsonl": Reader(seeds.history, _histories, "json"),
@@ -400,8 +403,10 @@ READERS = {
     "nerfstudio transforms.json": Reader(
         lambda d: seeds.foreign(d, "nerfstudio", "transforms.json"), _imported, "json"
     ),
-    "VHAP transforms.json": Reader(lambda d: seeds.foreign(d, "vhap", "transforms.json"), _imported, "json"),
-    "VHAP flame_param": Reader(lambda d: seeds.foreign(d, "vhap", "flame_param/*.npz"), _imported, "zip"),
+    "VHAP transforms.json": Reader(
+        lambda d: seeds.foreign(d, "vhap", "transforms.json"), _imported, "json", heavy=True
+    ),
+    "VHAP flame_param": Reader(lambda d: seeds.foreign(d, "vhap", "flame_param/*.npz"), _imported, "zip", heavy=True),
     "COLMAP cameras.bin": Reader(lambda d: seeds.foreign(d, "colmap", "cameras.bin"), _imported, "bytes"),
     "COLMAP images.bin": Reader(lambda d: seeds.foreign(d, "colmap", "images.bin"), _imported, "bytes"),
     "COLMAP cameras.txt": Reader(lambda d: seeds.foreign(d, "colmap text", "cameras.txt"), _imported, "text"),

@@ -20,8 +20,7 @@ def folder():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_read_or_refused_in_one_line(name, folder, capfd):
-    # Readers that parse YAML in Python take milliseconds a file; a tenth of the files has to do for them.
-    count = 200 if name.endswith(".yaml") else 2000
+    count = 200 if READERS[name].heavy else 2000
     outcome = drive(name, folder, count)
     assert not outcome.escapes, [(number, repr(error)[:300]) for number, error in outcome.escapes[:5]]
     assert not outcome.ran
