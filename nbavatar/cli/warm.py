@@ -148,11 +148,13 @@ def _load() -> None:
     import nbavatar.evaluation.evaluate
     import nbavatar.evaluation.speed
     import nbavatar.training.loop  # noqa: F401
+    from nbavatar.methods.photometric import loss_dssim
     from nbavatar.rendering.billboards.functional import render_billboards
 
     alpha, camera = torch.zeros(1, 1, 1), torch.eye(4)
     place = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 2)
     render_billboards(*place, torch.zeros(1, 1, 1, 3), alpha, camera, camera[:3, :3], 1, 1)
+    loss_dssim(torch.zeros(1, 1, 1), torch.zeros(1, 1, 1))
 
 
 class _Server:

@@ -15,8 +15,8 @@ __all__ = ["blur"]
 def blur(planes: Tensor, taps: Tensor) -> Tensor:
     """The window laid over every pixel of every plane; beyond the planes lie zeros.
 
-    On a CPU by a compiled kernel: a tenth of the time of torch's convolutions, which serve other devices. The
-    gradient is the window again, for it is symmetric.
+    On a CPU by a compiled kernel, since torch's convolutions of single planes are slow there; they serve other devices.
+    The gradient is the window again, for it is symmetric.
 
     Args:
         planes: float32 or float64 [N, H, W].
@@ -49,9 +49,10 @@ def _blurred(planes: Tensor, taps: Tensor) -> Tensor:
         count, windows = len(planes), taps.expand(len(planes), 1, -1)
         rows = F.conv2d(planes[None], windows[..., None], padding=(half, 0), groups=count)
         return F.conv2d(rows, windows[:, :, None], padding=(0, half), groups=count)[0]
-    from nbavatar.math.blur_kernels import blur_rows  # Numba is loaded only when it is needed
+    from nbavatar.math.blur_kernels import blur_rows, prepare_kernels  # Numba is loaded only when it is needed
 
-    padded, window = F.pad(planes, (half, half, half, half)).numpy(), taps.numpy()
+    prepare_kernels(planes.dtype)
+    padded, window = F.pad(planes, (half, half, half, half)).contiguous().numpy(), taps.contiguous().numpy()
     result = np.zeros(tuple(planes.shape), padded.dtype)
     height, threads = planes.shape[1], torch.get_num_threads()
     run_workers(

@@ -1,10 +1,12 @@
 """Numba kernels of `nbavatar.math.blur`: from row to row first, then along each row, so that both run over memory."""
 
 import numpy as np
+import torch
+from numba import types
 
-from nbavatar.jit.compile import inlined, kernel
+from nbavatar.jit.compile import inlined, kernel, prepare
 
-__all__ = ["blur_rows"]
+__all__ = ["blur_rows", "prepare_kernels"]
 
 
 @kernel
@@ -42,3 +44,10 @@ def _along(values: np.ndarray, window: np.ndarray, result: np.ndarray) -> None:
         weight, left, right = window[k], values[k : k + width], values[2 * half - k : 2 * half - k + width]
         for i in range(width):
             result[i] += weight * (left[i] + right[i])
+
+
+def prepare_kernels(dtype: torch.dtype) -> None:
+    """Has the kernel compiled for a dtype, float32 or float64, by one of several processes that start at once."""
+    real = types.float32 if dtype == torch.float32 else types.float64
+    planes, i64 = types.Array(real, 3, "C"), types.int64
+    prepare(f"blur-{real}", {blur_rows: (planes, types.Array(real, 1, "C"), i64, i64, planes)})

@@ -51,7 +51,7 @@ def loss_dssim(image: Tensor, target: Tensor, *, pixels: int | None = None) -> T
     right.
 
     Args:
-        image, target: float [C, H, W] in [0, 1].
+        image, target: float32 or float64 [C, H, W] in [0, 1].
         pixels: as in `loss_mse`; what is equal in both must then reach 5 px into the images for the mean to be exact.
 
     Returns:
@@ -60,7 +60,7 @@ def loss_dssim(image: Tensor, target: Tensor, *, pixels: int | None = None) -> T
     channels, height, width = image.shape
     # The variances count as their sum only, so the squares are blurred together.
     moments = torch.stack((image, target, image.square() + target.square(), image * target))
-    blurred = blur(moments.flatten(0, 1), _taps(image.dtype, image.device)).view(4, channels, height, width)
+    blurred = blur(moments.flatten(0, 1), _taps(moments.dtype, image.device)).view(4, channels, height, width)
     mean_x, mean_y, squares, product = blurred
     means, energy = mean_x * mean_y, mean_x.square() + mean_y.square()
     ssim = (2 * means + _C1) * (2 * (product - means) + _C2)

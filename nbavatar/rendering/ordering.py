@@ -65,16 +65,16 @@ def canonical_rank(
         geometry = torch.cat([depth[members, None].double(), means[members].double(), quats[members].double(),
                               half_extents[members].double()], 1).cpu().numpy()  # fmt: skip
     order = np.lexsort(geometry.T[::-1])
-    textures = (alpha, features) if uniform is None else (alpha, features, uniform)
-    order = _order_twins(order, geometry, members.cpu().numpy(), textures)
+    values = (alpha, features) if uniform is None else (alpha, features, uniform)
+    order = _order_twins(order, geometry, members.cpu().numpy(), values)
     rank[places] = members[torch.from_numpy(order).to(members.device)]
     return rank
 
 
 def _order_twins(
-    order: np.ndarray, geometry: np.ndarray, members: np.ndarray, textures: tuple[Tensor, ...]
+    order: np.ndarray, geometry: np.ndarray, members: np.ndarray, values: tuple[Tensor, ...]
 ) -> np.ndarray:
-    """Orders runs of billboards of identical geometry by their textures, in the same way in every precision."""
+    """Orders runs of billboards of identical geometry by what else they have, in the same way in every precision."""
     sorted_geometry = geometry[order]
     same = (sorted_geometry[1:] == sorted_geometry[:-1]).all(1)
     if not same.any():
@@ -88,7 +88,7 @@ def _order_twins(
             def texture_bytes(position: int) -> bytes:
                 row = int(members[position])
                 # Widened: float32 and float64 copies of one texture must compare alike.
-                return b"".join(part[row].detach().double().cpu().numpy().tobytes() for part in textures)
+                return b"".join(part[row].detach().double().cpu().numpy().tobytes() for part in values)
 
             order[start:end] = sorted(run, key=texture_bytes)
     return order

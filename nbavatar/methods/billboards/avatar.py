@@ -211,7 +211,7 @@ class Avatar(MeshAvatar):
             region.width,
             region.height,
             order=order or a.order,
-            uniform=self.told(posed, viewmat),
+            uniform=self.light_and_gloss(posed, viewmat),
         )
         if a.gloss:
             # Whatever the loss would like gloss to be, billboards neither move nor fade for it: trainings that let them
@@ -225,8 +225,8 @@ class Avatar(MeshAvatar):
         features = self.billboards.features
         return (features if self.unet is not None else torch.sigmoid(features)), self.billboards.alpha()
 
-    def told(self, posed: Posed, viewmat: Tensor) -> Tensor:
-        """What is rasterized for the decoder beside the textures: light and gloss of each billboard (F, L).
+    def light_and_gloss(self, posed: Posed, viewmat: Tensor) -> Tensor:
+        """What is rasterized for the decoder beside the textures: light and gloss of each billboard (F, D).
 
         Not part of the paper. Where light stands still, how bright a surface is depends on its direction in the world
         and on what shadows it, and a texture that rides with the mesh cannot say so.
@@ -321,7 +321,7 @@ class Avatar(MeshAvatar):
             if keep is not None:
                 features, alpha = features[keep], alpha[keep]
             window = self.window(posed, keep, viewmat, K, width, height)
-            told = self.told(posed, viewmat)
+            told = self.light_and_gloss(posed, viewmat)
             rgb = features[..., [min(i, features.shape[-1] - 1) for i in range(3)]].contiguous()
         region = window.region
 

@@ -58,7 +58,7 @@ def blend_cpu(
     `uniform` (F, D): further channels, which all texels of a billboard have in common. They are not written to every
     texel first: of thirteen channels of which seven are uniform a training step then copies half as much.
 
-    Works in the wider dtype of `features` and `alpha`, float32 or float64 (half precision is
+    Works in the widest dtype of `features`, `alpha` and `uniform`, float32 or float64 (half precision is
     widened, which copies the textures), and returns that dtype.
 
     Raises:
@@ -115,13 +115,13 @@ class _Scene:
     ) -> None:  # fmt: skip
         s = self.settings = settings
         self.dtype = alpha.dtype
-        self.texels, self.own, self.count = alpha.shape[-1], features.shape[-1], len(alpha)
-        self.uniform = uniform.shape[-1]
-        self.channels = self.own + self.uniform
+        self.texels, self.texture_channels, self.count = alpha.shape[-1], features.shape[-1], len(alpha)
+        self.uniform_channels = uniform.shape[-1]
+        self.channels = self.texture_channels + self.uniform_channels
         self.stride = -(-self.channels // LANES) * LANES
         prepare_kernels(self.dtype)
-        rows = uniform.new_zeros((self.count, self.stride if self.uniform else 0))
-        rows[:, self.own : self.channels] = uniform.detach()
+        rows = uniform.new_zeros((self.count, self.stride if self.uniform_channels else 0))
+        rows[:, self.texture_channels : self.channels] = uniform.detach()
         self.textures = Textures(*(values.detach().view(-1).numpy() for values in (features, alpha, rows)))
         self.bins = bin_billboards(
             projection, rank, self.texels, s.width, s.height, s.support, self.dtype, by_nearest=s.queue < 0
@@ -167,18 +167,19 @@ class _Scene:
         size = self.real.itemsize
         texels = self.count * self.texels**2
         require_memory(
-            texels * (self.own + 1) * size + s.width * s.height * (self.stride + 1) * size,
+            (texels * (self.texture_channels + 1) + self.count * self.stride) * size
+            + s.width * s.height * (self.stride + 1) * size,
             f"the gradients of {self.count} billboards",
         )
         grad_alpha = torch.from_numpy(self._empty(self.count, self.texels, self.texels))
-        grad_features = torch.from_numpy(self._empty(*grad_alpha.shape, self.own))
-        grad_uniform = torch.from_numpy(self._empty(self.count, self.stride if self.uniform else 0))
+        grad_features = torch.from_numpy(self._empty(*grad_alpha.shape, self.texture_channels))
+        grad_uniform = torch.from_numpy(self._empty(self.count, self.stride if self.uniform_channels else 0))
         grad_plane = torch.empty(self.count, 3, 3, dtype=torch.float64)
         grad_fade = torch.empty(self.count, dtype=torch.float64)
         adjoints = Adjoints(self._rows(grad_image), grad_opacity.to(self.dtype).contiguous().view(-1).numpy())
         flat = (values.view(-1).numpy() for values in (grad_features, grad_alpha, grad_uniform))
         self._replay(adjoints, Gradients(*flat, grad_plane.numpy(), grad_fade.numpy()))
-        return grad_features, grad_alpha, grad_uniform[:, self.own : self.channels], grad_plane, grad_fade
+        return grad_features, grad_alpha, grad_uniform[:, self.texture_channels : self.channels], grad_plane, grad_fade
 
     def _rows(self, image: Tensor) -> np.ndarray:
         """An image (C, H, W) as (H, W, stride), flat."""
@@ -242,8 +243,8 @@ class _Scene:
         s = self.settings
         across = -(-s.width // binning.TILE_WIDTH)
         return Shape(
-            self.texels, self.own, self.uniform, s.width, s.height, across, s.queue, sizes.capacity, sizes.rows,
-            sizes.bundles,
+            self.texels, self.texture_channels, self.uniform_channels, s.width, s.height, across, s.queue,
+            sizes.capacity, sizes.rows, sizes.bundles,
         )  # fmt: skip
 
     def _run(self, plan: _Pass, images: Images | None, backward: tuple[Adjoints, Tape] | None) -> list[np.ndarray]:

@@ -160,7 +160,7 @@ def write_band(scene, scratch, images, band, width, height):
     one, left, right = scene.lanes.one, band.left, band.right
     image, opacity = images.features, images.opacity
     area, stride = np.int64(width) * height, scene.layout.stride
-    if width % (2 * LANES) == 0 and area * scene.layout.image >= LARGE:
+    if width % (2 * LANES) == 0 and area * scene.layout.image_channels >= LARGE:
         # A large image is not in the caches when it is read: writing past them saves reading the memory first. The
         # second half of a line follows the first at once: few lines can be under way.
         for y in range(band.top, band.bottom):
@@ -169,10 +169,10 @@ def write_band(scene, scratch, images, band, width, height):
                 pixel = np.int64(y) * width + x
                 stream(opacity, pixel, one - load(scratch.transmittance, first))
                 stream(opacity, pixel + LANES, one - load(scratch.transmittance, first + LANES))
-                for c in range(0, scene.layout.image, LANES):
+                for c in range(0, scene.layout.image_channels, LANES):
                     here = _channels(scratch, first * stride + c, stride)
                     beside = _channels(scratch, (first + LANES) * stride + c, stride)
-                    for lane in range(min(LANES, scene.layout.image - c)):
+                    for lane in range(min(LANES, scene.layout.image_channels - c)):
                         stream(image, (c + lane) * area + pixel, here[lane])
                         stream(image, (c + lane) * area + pixel + LANES, beside[lane])
         return
@@ -182,7 +182,7 @@ def write_band(scene, scratch, images, band, width, height):
             first = (y - band.top) * TILE_WIDTH + x - left
             pixel = np.int64(y) * width + x
             masked_store(opacity, pixel, one - load(scratch.transmittance, first), used)
-            for c in range(0, scene.layout.image, LANES):
+            for c in range(0, scene.layout.image_channels, LANES):
                 channels = _channels(scratch, first * stride + c, stride)
-                for lane in range(min(LANES, scene.layout.image - c)):
+                for lane in range(min(LANES, scene.layout.image_channels - c)):
                     masked_store(image, (c + lane) * area + pixel, channels[lane], used)

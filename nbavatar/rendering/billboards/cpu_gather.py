@@ -51,7 +51,8 @@ GATHER_BUFFERS = (
     Buffer("texel", None, lambda n: LANES),  # numbers of the first texels, as floating-point numbers
     # of the current billboard
     Buffer("dL_dalpha", None, lambda n: n.texels**2),
-    Buffer("dL_dfeature", None, lambda n: n.texels**2 * n.stride),  # whole vectors a texel
+    # whole vectors a texel, of the texture's channels only; the size counts all of the image's
+    Buffer("dL_dfeature", None, lambda n: n.texels**2 * n.stride),
     Buffer("dL_duniform", None, lambda n: n.stride),  # of all channels; the texture's own are not read
 )
 GatherScratch = namedtuple("GatherScratch", [buffer.name for buffer in GATHER_BUFFERS])
@@ -165,9 +166,9 @@ def _add_hits(word, scratch, adjoints, width, pixels, features, uniform, layout,
             _add(totals, right * kept + c, dL_dcolour * w01)
             _add(totals, below * kept + c, dL_dcolour * w10)
             _add(totals, (below + right) * kept + c, dL_dcolour * w11)
-        if layout.image > channels:
+        if layout.image_channels > channels:
             inside, same = (w00 + w01) + (w10 + w11), broadcast(zero)
-            for c in range(channels // LANES * LANES, layout.image, LANES):
+            for c in range(channels // LANES * LANES, layout.image_channels, LANES):
                 dL_dcolour = load(row, c)
                 same = same + dL_dcolour * load(uniform, c)
                 _add(scratch.dL_duniform, c, dL_dcolour * inside)
@@ -197,7 +198,7 @@ def _hand_over(scratch, features, alpha, uniform, layout, fresh):
             masked_store(features, texel * channels + c, value, used)
         value = get(scratch.dL_dalpha, texel)
         put(alpha, texel, value if fresh else get(alpha, texel) + value)
-    if layout.image > channels:
+    if layout.image_channels > channels:
         for c in range(0, layout.stride, LANES):
             value = load(scratch.dL_duniform, c)
             store(uniform, c, value if fresh else load(uniform, c) + value)
@@ -329,7 +330,7 @@ def gather_gradients(counter, part, bins, textures_, constants, shape, adjoints_
                     put(grad_features, j, zero)
                 for j in range(area):
                     put(grad_alpha, j, zero)
-                if layout.image > shape.channels:
+                if layout.image_channels > shape.channels:
                     for j in range(layout.stride):
                         put(grad_uniform, j, zero)
             if not used:

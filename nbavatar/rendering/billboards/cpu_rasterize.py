@@ -152,7 +152,7 @@ def feature_of(scene, scratch, features, uniform, lane, c):
         texel = advance(features, np.int64(get(scratch.texel, lane)) * layout.channels + c)
         above = masked_load(texel, 0, used) * w00 + masked_load(texel, right, used) * w01
         feature = above + (masked_load(texel, below, used) * w10 + masked_load(texel, right + below, used) * w11)
-    if layout.image > layout.channels:
+    if layout.image_channels > layout.channels:
         feature = feature + load(uniform, c) * ((w00 + w01) + (w10 + w11))
     return feature
 

@@ -159,8 +159,8 @@ class Layout(NamedTuple):
 
     texels: Any  # a side
     step: Any  # min(1, texels - 1): from a texel to the next
-    channels: Any
-    image: Any  # channels of the image: those of the texture, and behind them the uniform ones
+    channels: Any  # of a texture
+    image_channels: Any  # those of the texture, and behind them the uniform ones
     stride: Any  # see `Sizes`
 
 

@@ -93,8 +93,8 @@ def render_billboards(
     if features is None and isinstance(alpha, Tensor):
         features = alpha.new_zeros(*alpha.shape, 0)
     assert features is not None
-    uniform = features.new_zeros((len(features), 0)) if uniform is None else uniform
     _check_tensors(means, quats, half_extents, features, alpha, viewmat, K, uniform)
+    uniform = features.new_zeros((len(features), 0)) if uniform is None else uniform
     _check_options(width, height, near, alpha_min, alpha_max, t_min, low_pass)
     queue = parse_order(order)
     project, blend = _backend(backend, means.device)
@@ -151,19 +151,20 @@ def _in_texels(
 ) -> tuple[Tensor, Tensor]:
     """Blending that knows textures only: what the texels of a billboard have in common is written to each."""
     if uniform.shape[-1]:
-        repeated = uniform.to(features.dtype)[:, None, None].expand(*alpha.shape, -1)
-        features = torch.cat((features, repeated), dim=-1)
+        features = torch.cat((features, uniform[:, None, None].expand(*alpha.shape, -1)), dim=-1)  # the wider type
     return blend(projection, rank, features, alpha, settings)
 
 
 def _check_tensors(
     means: Tensor, quats: Tensor, half_extents: Tensor, features: Tensor, alpha: Tensor, viewmat: Tensor, K: Tensor,
-    uniform: Tensor,
+    uniform: Tensor | None,
 ) -> None:  # fmt: skip
     named = {
         "means": means, "quats": quats, "half_extents": half_extents, "features": features, "alpha": alpha,
-        "viewmat": viewmat, "K": K, "uniform": uniform,
+        "viewmat": viewmat, "K": K,
     }  # fmt: skip
+    if uniform is not None:
+        named["uniform"] = uniform
     for name, value in named.items():
         if not isinstance(value, Tensor) or not value.is_floating_point():
             found = f"{value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
@@ -179,7 +180,8 @@ def _check_tensors(
         raise DataError.of(_WHERE, "alpha", expected="at least one texel a side", found=f"shape {tuple(alpha.shape)}")
     channels = features.shape[-1] if features.ndim == 4 else -1
     _check_shape("features", features, (count, texels, texels, channels))
-    _check_shape("uniform", uniform, (count, uniform.shape[-1] if uniform.ndim == 2 else -1))
+    if uniform is not None:
+        _check_shape("uniform", uniform, (count, uniform.shape[-1] if uniform.ndim == 2 else -1))
     for name, value, side in (("viewmat", viewmat, 4), ("K", K, 3)):
         if value.ndim not in (2, 3) or value.shape[-2:] != (side, side) or value.shape[0] == 0:
             raise DataError.of(_WHERE, name, expected=f"({side}, {side}) or (B, {side}, {side})",

@@ -147,7 +147,7 @@ def _parts(scene: StepScene, crop: int) -> dict[str, Callable[[], None]]:
     posed, _ = avatar.pose(verts, FRAME)
     textures, cover = avatar.textures()
     fixed = [value.detach().requires_grad_(True) for value in (*posed.planes, textures, cover)]
-    told = avatar.told(posed, view).detach()
+    told = avatar.light_and_gloss(posed, view).detach()
     region = full_region(side, side, avatar.multiple)
     stored = (sample.pixels.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
 

@@ -288,7 +288,7 @@ class TunedAvatar:
         return render_billboards(
             *posed.planes, features, alpha, viewmat, shift_camera(K, region), region.width, region.height,
             order=s.order or scene.avatar.architecture.order, alpha_min=s.alpha_min, t_min=s.t_min,
-            low_pass=s.low_pass, uniform=scene.avatar.told(posed, viewmat),
+            low_pass=s.low_pass, uniform=scene.avatar.light_and_gloss(posed, viewmat),
         )  # fmt: skip
 
     def _decode(self, features: Tensor, nb_alpha: Tensor) -> tuple[Tensor, Tensor]:

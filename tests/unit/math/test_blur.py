@@ -5,6 +5,7 @@ import torch
 from torch.nn import functional as F
 
 from nbavatar.math.blur import blur
+from nbavatar.math.blur_kernels import blur_rows
 
 
 def convolved(planes: torch.Tensor, taps: torch.Tensor) -> torch.Tensor:
@@ -43,3 +44,4 @@ def test_planes_that_lie_otherwise_in_memory_and_any_number_of_threads_give_the_
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(result, results[0]) for result in results)
+    assert len(blur_rows.signatures) <= 2  # those that `prepare_kernels` declares, float32 and float64, and no other

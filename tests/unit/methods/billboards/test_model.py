@@ -245,7 +245,7 @@ def test_a_decoder_that_sees_normals_is_told_how_the_head_is_turned(tmp_path) ->
 def test_a_decoder_that_sees_gloss_is_told_where_faces_mirror_the_camera_to(tmp_path) -> None:
     avatar = make_avatar(normals=True, gloss=True)
     posed, _ = avatar.pose(VERTS)
-    told = avatar.told(posed, VIEW)
+    told = avatar.light_and_gloss(posed, VIEW)
     assert told.shape == (12, 3 + 3)
     eye = torch.tensor([0.0, 0.0, -1.0])
     for f in range(12):
@@ -257,7 +257,7 @@ def test_a_decoder_that_sees_gloss_is_told_where_faces_mirror_the_camera_to(tmp_
     # From elsewhere the same pose is told otherwise.
     other = VIEW.clone()
     other[0, 3] = 0.4
-    assert (avatar.told(posed, other) - told)[:, 3:].abs().max() > 0.1
+    assert (avatar.light_and_gloss(posed, other) - told)[:, 3:].abs().max() > 0.1
     save_avatar(tmp_path / "model.pt", avatar)
     for a, b in zip(render(avatar), render(load_avatar(tmp_path / "model.pt")), strict=True):
         assert torch.equal(a, b)
