@@ -198,10 +198,8 @@ def _features(
     if not isinstance(avatar, Avatar) or avatar.unet is None:
         return None
     posed, keep = avatar.pose(verts, frame)
-    features, alpha = avatar.textures()
+    features, alpha = avatar.textures(keep)
     features = features[..., [min(i, features.shape[-1] - 1) for i in range(3)]].contiguous()
-    if keep is not None:
-        features, alpha = features[keep], alpha[keep]
     shown, _ = render_billboards(
         *posed.planes, features, alpha, viewmat, K, width, height, order=avatar.architecture.order
     )

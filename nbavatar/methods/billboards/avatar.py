@@ -194,16 +194,12 @@ class Avatar(MeshAvatar):
             engine: whether the avatar's engine may decode.
         """
         a = self.architecture
-        features, alpha = self.textures()
-        if keep is not None:
-            features, alpha = features[keep], alpha[keep]
+        features, alpha = self.textures(keep)
         region = full_region(width, height, self.multiple)
         if a.roi if roi is None else roi:
             region = region_of(posed, viewmat, K, width, height, multiple=self.multiple, margin=a.roi_margin)
         premultiplied, nb_alpha = render_billboards(
-            posed.means,
-            posed.quats,
-            posed.half_extents,
+            *posed.planes,
             features,
             alpha,
             viewmat,
@@ -220,10 +216,11 @@ class Avatar(MeshAvatar):
         colour, opacity = self.decode(premultiplied, nb_alpha, precision, engine=engine)
         return Window(colour, opacity, nb_alpha, premultiplied, region)
 
-    def textures(self) -> tuple[Tensor, Tensor]:
-        """Activated textures: features (F, T, T, C) and opacity (F, T, T)."""
-        features = self.billboards.features
-        return (features if self.unet is not None else torch.sigmoid(features)), self.billboards.alpha()
+    def textures(self, keep: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Activated textures: features (F, T, T, C) and opacity (F, T, T); of the billboards `keep` (None: all)."""
+        features, alpha = self.billboards.features, self.billboards.alpha()
+        features = features if self.unet is not None else torch.sigmoid(features)
+        return (features, alpha) if keep is None else (features[keep], alpha[keep])
 
     def light_and_gloss(self, posed: Posed, viewmat: Tensor) -> Tensor:
         """What is rasterized for the decoder beside the textures: light and gloss of each billboard (F, D).
@@ -317,9 +314,7 @@ class Avatar(MeshAvatar):
         """Stages of the paper's timing table: pose, raster (neural textures, RGB), renderer, compose, total."""
         with torch.no_grad():
             posed, keep = self.pose(verts)
-            features, alpha = self.textures()
-            if keep is not None:
-                features, alpha = features[keep], alpha[keep]
+            features, alpha = self.textures(keep)
             window = self.window(posed, keep, viewmat, K, width, height)
             told = self.light_and_gloss(posed, viewmat)
             rgb = features[..., [min(i, features.shape[-1] - 1) for i in range(3)]].contiguous()

@@ -34,7 +34,7 @@ from nbavatar.rendering.billboards.cpu_intersection import (
     plane_slopes,
     slopes,
 )
-from nbavatar.rendering.billboards.cpu_scratch import COLUMN, ROW, Layout
+from nbavatar.rendering.billboards.cpu_scratch import COLUMN, ROW, layout_of, whole_vectors
 from nbavatar.rendering.binning import RECORD, TILE_HEIGHT, TILE_WIDTH
 from nbavatar.rendering.scratch import Buffer
 
@@ -98,7 +98,7 @@ def interleave(counter, chunk, planes_, rows_, channels, pixels):
         planes: (channels, pixels) flat; rows: (pixels, stride) flat, the result.
     """
     planes, rows = pointer(planes_, 0), pointer(rows_, 0)
-    stride = (channels + LANES - 1) // LANES * LANES
+    stride = whole_vectors(channels)
     while True:
         begin = fetch_add(counter, chunk)
         if begin >= pixels:
@@ -136,7 +136,7 @@ def _add_hits(word, scratch, adjoints, width, pixels, features, uniform, layout,
         features, uniform: pointers to the billboard's.
     """
     channels, stride, right, below = layout.channels, layout.stride, layout.step, layout.step * layout.texels
-    kept = _whole(channels)
+    kept = whole_vectors(channels)
     alpha, product = scratch.dL_dalpha, scratch.product
     while word != 0:
         lane = count_trailing_zeros(word)
@@ -180,15 +180,9 @@ def _add_hits(word, scratch, adjoints, width, pixels, features, uniform, layout,
 
 
 @inlined
-def _whole(channels):
-    """Channels filled up to whole vectors."""
-    return (channels + LANES - 1) // LANES * LANES
-
-
-@inlined
 def _hand_over(scratch, features, alpha, uniform, layout, fresh):
     """Copies a billboard's sums to the results, or adds them."""
-    channels, kept = layout.channels, _whole(layout.channels)
+    channels, kept = layout.channels, whole_vectors(layout.channels)
     for texel in range(layout.texels * layout.texels):
         for c in range(0, channels, LANES):
             used = first_lanes(channels - c)
@@ -224,8 +218,7 @@ def gather_gradients(counter, part, bins, textures_, constants, shape, adjoints_
     tile_bundle = tape_.tile_bundle
     lanes = broadcast_constants(constants)
     zero, zeros = constants.zero, lanes.zero
-    image_channels = shape.channels + shape.uniform
-    layout = Layout(texels, min(1, texels - 1), shape.channels, image_channels, _whole(image_channels))
+    layout = layout_of(shape)
     area, step, size = texels * texels, layout.step, textures_.alpha.itemsize
     scale = 0.5 * (texels - 1) if texels > 1 else 1.0
     middle = broadcast(zero + np.float32(0.5 * (texels - 1)))  # of a texture: where its plane's coordinates are 0
@@ -273,7 +266,7 @@ def gather_gradients(counter, part, bins, textures_, constants, shape, adjoints_
                             used = True
                             for j in range(area):
                                 put(scratch.dL_dalpha, j, zero)
-                            for j in range(area * _whole(shape.channels)):
+                            for j in range(area * whole_vectors(shape.channels)):
                                 put(scratch.dL_dfeature, j, zero)
                             for j in range(layout.stride):
                                 put(scratch.dL_duniform, j, zero)

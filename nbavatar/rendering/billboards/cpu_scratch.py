@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nbavatar.jit.compile import inlined
 from nbavatar.jit.lanes import LANES
 from nbavatar.rendering.binning import TILE_HEIGHT, TILE_WIDTH
 from nbavatar.rendering.scratch import FORWARD, REPLAY, Buffer
@@ -15,7 +16,8 @@ from nbavatar.rendering.sorting import LONGEST
 
 __all__ = [
     "BROKEN", "BUFFERS", "COLUMN", "CORNER", "GIVEN_UP", "HITS", "LANE", "LIST", "ROW", "SHIFT", "Adjoints", "Band",
-    "Extent", "Images", "Layout", "Scene", "Scratch", "Shape", "Sizes", "Tape", "Textures",
+    "Extent", "Images", "Layout", "Scene", "Scratch", "Shape", "Sizes", "Tape", "Textures", "layout_of",
+    "whole_vectors",
 ]  # fmt: skip
 
 ROW, COLUMN = TILE_WIDTH.bit_length() - 1, TILE_WIDTH - 1  # a pixel's place in a band is row << ROW | column
@@ -198,3 +200,16 @@ class Scene(NamedTuple):
     adjoints: Any
     tape: Any
     status: Any
+
+
+@inlined
+def whole_vectors(channels):
+    """Channels filled up to whole vectors."""
+    return (channels + LANES - 1) // LANES * LANES
+
+
+@inlined
+def layout_of(shape):
+    """Layout of the textures of a `Shape`."""
+    image_channels = shape.channels + shape.uniform
+    return Layout(shape.texels, min(1, shape.texels - 1), shape.channels, image_channels, whole_vectors(image_channels))

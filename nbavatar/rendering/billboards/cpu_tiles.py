@@ -18,7 +18,7 @@ from nbavatar.rendering.billboards.cpu_blend import blend_unsorted, write_band
 from nbavatar.rendering.billboards.cpu_intersection import NEAREST_KEY, broadcast_constants
 from nbavatar.rendering.billboards.cpu_rasterize import intersect_packets, list_hits, list_packets, sample_features
 from nbavatar.rendering.billboards.cpu_replay import differentiate, record_pixels, record_weight_adjoints
-from nbavatar.rendering.billboards.cpu_scratch import BROKEN, GIVEN_UP, HITS, LIST, Band, Extent, Layout, Scene
+from nbavatar.rendering.billboards.cpu_scratch import BROKEN, GIVEN_UP, HITS, LIST, Band, Extent, Scene, layout_of
 from nbavatar.rendering.billboards.cpu_sort import blend_final, enqueue, enqueue_and_blend
 from nbavatar.rendering.binning import RECORD, TILE_WIDTH, tile_bounds
 from nbavatar.rendering.sorting import LONGEST
@@ -88,14 +88,12 @@ def _build(replay):
         box, tile_start, packed = bins.box, bins.tile_start, pointers(bins)
         members, record, rank = packed.members, packed.record, packed.rank
         textures, scratch, tape = pointers(textures_), pointers(scratch_), pointers(tape_)
-        image_channels = shape.channels + shape.uniform
-        stride = (image_channels + LANES - 1) // LANES * LANES
+        layout = layout_of(shape)
+        stride = layout.stride
         pixels = TILE_WIDTH * rows + LANES
         scene = Scene(
-            textures.features, textures.uniform,
-            Layout(texels, min(1, texels - 1), shape.channels, image_channels, stride), constants,
-            broadcast_constants(constants), pixels, shape.bundles * LANES, pointers(adjoints_), tape,
-            pointer(status, 0),
+            textures.features, textures.uniform, layout, constants, broadcast_constants(constants), pixels,
+            shape.bundles * LANES, pointers(adjoints_), tape, pointer(status, 0),
         )  # fmt: skip
         for i in range(max(capacity, LONGEST) * pixels):  # a free slot's number is looked up as well
             put(scratch.queue_hit, i, 0)

@@ -21,7 +21,7 @@ __all__ = ["render_billboards"]
 _WHERE = "render_billboards"
 _BACKENDS = ("auto", "reference", "cpu", "cuda")
 _Project = Callable[..., ProjectedPatches]
-_Blend = Callable[[ProjectedPatches, Tensor, Tensor, Tensor, BlendSettings, Tensor], tuple[Tensor, Tensor]]
+_Blend = Callable[[ProjectedPatches, Tensor, Tensor, Tensor, BlendSettings, Tensor | None], tuple[Tensor, Tensor]]
 
 
 def render_billboards(
@@ -94,7 +94,6 @@ def render_billboards(
         features = alpha.new_zeros(*alpha.shape, 0)
     assert features is not None
     _check_tensors(means, quats, half_extents, features, alpha, viewmat, K, uniform)
-    uniform = features.new_zeros((len(features), 0)) if uniform is None else uniform
     _check_options(width, height, near, alpha_min, alpha_max, t_min, low_pass)
     queue = parse_order(order)
     project, blend = _backend(backend, means.device)
@@ -147,10 +146,10 @@ def _in_texels(
     features: Tensor,
     alpha: Tensor,
     settings: BlendSettings,
-    uniform: Tensor,
+    uniform: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Blending that knows textures only: what the texels of a billboard have in common is written to each."""
-    if uniform.shape[-1]:
+    if uniform is not None and uniform.shape[-1]:
         features = torch.cat((features, uniform[:, None, None].expand(*alpha.shape, -1)), dim=-1)  # the wider type
     return blend(projection, rank, features, alpha, settings)
 
