@@ -8,7 +8,7 @@ from pathlib import Path
 from nbavatar.config.core import option
 from nbavatar.errors import ConfigError
 
-__all__ = ["CAMERAS", "RECORD", "SUBJECTS", "SynthesizeConfig", "refuse_others"]
+__all__ = ["CAMERAS", "HAIR", "RECORD", "SUBJECTS", "SynthesizeConfig", "refuse_others"]
 
 RECORD = "synthetic.json"
 """By this file in it a synthetic dataset is known; it is there before anything else."""
@@ -18,6 +18,9 @@ CAMERAS = ("084", "100", "102", "108", "110", "111", "121", "122")
 
 SUBJECTS = ("S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8")
 """Subjects of the release; S1, S3 and S6 lie in its folder `test`, the others in `train`."""
+
+HAIR = ("cap", "ponytail", "long", "beard")
+"""Styles of hair: on the scalp only, or also a ponytail, long hair over the shoulders, a full beard."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +32,9 @@ class SynthesizeConfig:
         choices=("decaf", "capture"),
     )  # fmt: skip
     hair: str = option(
-        "cap", "Hair: on the scalp only, or with a ponytail, which no mesh has.", choices=("cap", "ponytail")
+        "cap",
+        "Hair: on the scalp only, or also what no mesh has: a ponytail, long hair over the shoulders, a full beard.",
+        choices=HAIR,
     )
 
     subjects: tuple[str, ...] = option(("S1", "S2", "S3", "S4"), "Subjects to make.", choices=SUBJECTS)

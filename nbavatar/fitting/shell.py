@@ -3,9 +3,9 @@
 The visual hull of the head (`nbavatar.fitting.hull`) is carved in its rest frame. Of it only what the mesh cannot
 explain is kept: cells that lie farther from the mesh than `reach`, in views that show the head where nothing within
 `reach` of the mesh projects to, and what lies between them and the mesh. A hull bulges where no camera looks (behind
-the head, along the lines of sight); such bulges explain no pixel, and are not kept. Below the largest border of the
-mesh, the neck, nothing is looked for: what lies there does not move with the head. Where nothing reaches out there is
-no surface.
+the head, along the lines of sight); such bulges explain no pixel, and are not kept. Nothing is looked for where the
+neck goes on below the largest border of the mesh: that does not move with the head, as hair beside it does. Where
+nothing reaches out there is no surface.
 
 The surface moves with the head as a whole; where the skin under it moves besides (jaw, contact), the mean motion of the
 nearest skin is added, which fades in smoothly from vertex to vertex.
@@ -194,7 +194,7 @@ def _cells(
     height, _, _ = mesh.signed(np.ascontiguousarray(centres), np.inf)
     beyond = np.zeros(grid.count, bool)
     core = np.zeros(grid.count, bool)
-    above = ~_below_neck(centres, rest.verts, faces, rest.radius)
+    above = ~_in_neck(centres, rest.verts, faces, rest.radius, cfg.reach * rest.radius)
     beyond[hull] = (height > cfg.gap * rest.radius) & above
     explained = counts.unexplained.ravel()[hull] < np.maximum(cfg.support * seen.ravel()[hull], 1.0)
     core[hull] = (height > cfg.reach * rest.radius) & ~explained & above
@@ -209,20 +209,36 @@ def _cells(
 _LEAST = 0.25  # share of the views that must see a cell
 
 
-def _below_neck(points: np.ndarray, verts: np.ndarray, faces: np.ndarray, radius: float) -> np.ndarray:
-    """Which points (P, 3) lie beyond the plane of the mesh's largest border, if that is as large as a neck's."""
-    largest, around = None, 1.5 * radius
+def _in_neck(points: np.ndarray, verts: np.ndarray, faces: np.ndarray, radius: float, around: float) -> np.ndarray:
+    """Which points (P, 3) lie where the neck goes on: beyond the plane of the mesh's largest border, if that is as
+    long as a neck's, and within its outline or no farther than `around` beside it.
+    """
+    largest, longest = None, 1.5 * radius
     for loop in boundary_loops(faces):
         ring = verts[loop]
         length = float(np.linalg.norm(np.roll(ring, -1, 0) - ring, axis=1).sum())
-        if length > around:
-            largest, around = ring, length
+        if length > longest:
+            largest, longest = ring, length
     if largest is None:
         return np.zeros(len(points), bool)
     centre = largest.mean(0)
-    normal = np.cross(largest - centre, np.roll(largest, -1, 0) - centre).sum(0)
+    ring = largest - centre
+    normal = np.cross(ring, np.roll(ring, -1, 0)).sum(0)
+    normal /= np.linalg.norm(normal)
     normal = normal if normal @ (verts.mean(0) - centre) < 0 else -normal
-    return (points - centre) @ normal > 0
+    inside = (points - centre) @ normal > 0
+    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    axes = np.stack([across, np.cross(normal, across)], 1)
+    # The outline in polar coordinates about its centre, which sees all of a neck's.
+    direction, distance = _polar(ring @ axes)
+    towards, away = _polar((points[inside] - centre) @ axes)
+    inside[inside] = away < np.interp(towards, direction, distance, period=2.0 * np.pi) + around
+    return inside
+
+
+def _polar(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles [radians] and distances of points (P, 2) from the origin."""
+    return np.arctan2(points[:, 1], points[:, 0]), np.linalg.norm(points, axis=1)
 
 
 def _sparse(count: int) -> np.ndarray:

@@ -51,7 +51,7 @@ def write_capture(
         root: folder of the capture; made if absent.
         scene: the posed subject.
         cameras: pinholes, all of one size.
-        hair: cap or ponytail.
+        hair: style, one of `nbavatar.config.synthetic.HAIR`.
         supersample: samples a pixel along each side.
         mesh_noise: error of the meshes, multiples of 1 mm and 0.3 degrees.
         seed: of noise.

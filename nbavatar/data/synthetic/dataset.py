@@ -73,7 +73,7 @@ def write_dataset(
         supersample: samples a pixel along each side.
         mesh: "full" or "tiny".
         layout: "decaf", or "capture" for one capture a subject, `root/<subject>` (`synthetic.capture`).
-        hair: "cap" or "ponytail".
+        hair: style, one of `nbavatar.config.synthetic.HAIR`.
         focal: focal length over image height.
         distortion: factor on the lens distortion.
         press: how deep the hand reaches into the undeformed face [m].

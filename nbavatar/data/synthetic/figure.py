@@ -1,6 +1,6 @@
 """What the cameras see of a subject besides the two models: hair, clothed torso, arm; and the looks of all of it.
 
-Hair is a layer on the scalp; with the style `ponytail` there is also some that stands off the head (`synthetic.hair`).
+Hair is a layer on the scalp; some styles have more, on the chin or hanging off the head (`synthetic.hair`).
 """
 
 import dataclasses
@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 
 from nbavatar.data.synthetic.contact import vertex_normals
-from nbavatar.data.synthetic.hair import ponytail
+from nbavatar.data.synthetic.hair import beard, loose_hair
 from nbavatar.data.synthetic.models import EYE_ORIGIN, Human, hand_axes
 from nbavatar.data.synthetic.motion import Subject
 from nbavatar.data.synthetic.scene import STAGE_TO_WORLD, Scene
@@ -105,18 +105,21 @@ def looks_of(human: Human, subject: Subject) -> Looks:
 
 
 def build_figure(scene: Scene, hair: str = "cap") -> Figure:
-    """Collects the drawn mesh of one subject, with hair of a style: cap or ponytail."""
+    """Collects the drawn mesh of one subject, with hair of a style (`nbavatar.config.synthetic.HAIR`)."""
     human, subject = scene.bodies.human, scene.subject
     q = (human.head - EYE_ORIGIN) * 1e3
     skin = human.part_sizes[0]
     height = np.array([hairline(*row) for row in q])
     height[skin:] = -100
-    scalp = scene.bodies.skin_faces[(height[scene.bodies.skin_faces] > -14).all(1)]
+    chin = beard(q) if hair == "beard" else np.full(len(q), -1.0)
+    chin[skin:] = -1.0
+    covered = (height > -14) | (chin > -0.004)
+    scalp = scene.bodies.skin_faces[covered[scene.bodies.skin_faces].all(1)]
     ids = np.unique(scalp)
     renumber = np.full(len(q), -1)
     renumber[ids] = np.arange(len(ids))
     lump = 1 + 0.25 * np.sin(q[ids, 0] / 9 + subject.seed % 7) * np.sin(q[ids, 1] / 11) * np.sin(q[ids, 2] / 10)
-    lift = subject.hair_length * np.clip(height[ids] / 16, -0.45, 1.0) * lump - 0.001
+    lift = np.maximum(subject.hair_length * np.clip(height[ids] / 16, -0.45, 1.0), chin[ids]) * lump - 0.001
     torso = human.torso
     # cloth lies off the skin, and the collar most of all, so that a turning head does not bare the seam
     rim = torso[:, 1] - EYE_ORIGIN[1] + 0.150 + 0.3 * (torso[:, 2] - EYE_ORIGIN[2] + 0.08)
@@ -129,7 +132,7 @@ def build_figure(scene: Scene, hair: str = "cap") -> Figure:
             arm_faces += [[a, b, a + _ARM_SIDES], [b, b + _ARM_SIDES, a + _ARM_SIDES]]
     arm_faces = np.array(arm_faces)
     sleeve = (arm_faces.min(1) // _ARM_SIDES) < _ARM_RINGS * 6 // 10
-    tail, tail_faces = ponytail() if hair == "ponytail" else (np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    tail, tail_faces = loose_hair(hair)
     pieces = [human.head_faces, human.hand_faces, renumber[scalp], human.torso_faces, arm_faces, tail_faces]
     counts = (len(q), len(human.hand), len(ids), len(torso), _ARM_RINGS * _ARM_SIDES, len(tail))
     start = np.concatenate([[0], np.cumsum(counts)[:-1]])

@@ -8,6 +8,7 @@ import igl
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from nbavatar.bodymodels.files import read_flame, read_landmarks, read_mano
 from nbavatar.bodymodels.flame import Flame
@@ -20,6 +21,8 @@ from nbavatar.data.capture import open_capture, read_mesh, read_topology
 from nbavatar.data.synthetic.capture import labels_of
 from nbavatar.data.synthetic.dataset import write_dataset
 from nbavatar.data.synthetic.figure import build_figure, pose_figure
+from nbavatar.data.synthetic.hair import loose_hair
+from nbavatar.data.synthetic.models import EYE_ORIGIN
 from nbavatar.data.synthetic.scene import build_bodies, make_scene
 from nbavatar.data.synthetic.shading import ARM, CLOTH
 from nbavatar.data.synthetic.studio import lens_of, make_cameras
@@ -290,3 +293,29 @@ def test_labels_say_nothing_where_cloth_or_arm_hide_head_or_hand() -> None:
             assert (label[y, x] == 255) == hidden, (name, y, x)
             seen[hidden] += 1
     assert min(seen.values()) > 40, seen
+
+
+def test_beard_stands_off_chin_and_cheeks_and_leaves_the_lips_bare() -> None:
+    scene = make_scene(build_bodies("tiny"), "S2", 2, 0, dents=False)
+    head, faces = scene.head[0], scene.bodies.human.head_faces
+    points = (scene.bodies.human.head - EYE_ORIGIN) * 1e3
+    bearded, shaved = build_figure(scene, "beard"), build_figure(scene, "cap")
+    layer = pose_figure(bearded, scene, 0)[0][bearded.piece(2)[0]]
+    height = np.linalg.norm(layer - head[bearded.hair_ids], axis=1)
+    place = points[bearded.hair_ids]
+    added = ~np.isin(bearded.hair_ids, shaved.hair_ids)
+    chin = added & (np.abs(place[:, 0]) < 15) & (place[:, 1] < -95) & (place[:, 2] > -20)
+    assert chin.any() and height[chin].max() > 0.015  # a quarter of the head's radius and more, with the lump
+    assert not (added & (place[:, 1] > -35)).any()
+    lips = (np.abs(place[:, 0]) < 12) & (np.abs(place[:, 1] + 72) < 5) & (place[:, 2] > 0)
+    assert not lips.any() and faces.max() < len(head)
+
+
+def test_long_hair_is_of_closed_locks_that_reach_lower_than_the_head() -> None:
+    scene = make_scene(build_bodies("tiny"), "S2", 2, 0, dents=False)
+    verts, faces = loose_hair("long")
+    locks = trimesh.Trimesh(verts, faces, process=False).split(only_watertight=False)
+    assert len(locks) > 10 and all(lock.is_watertight and lock.volume > 0 for lock in locks)
+    lowest = (scene.bodies.human.head - EYE_ORIGIN)[:, 1].min()
+    assert verts[:, 1].min() < lowest - 0.01
+    assert not len(loose_hair("cap")[0])
