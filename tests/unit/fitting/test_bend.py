@@ -91,17 +91,20 @@ def test_exact_meshes_hardly_move(scene: Scene) -> None:
     assert _size(scene.bent(scene.exact, scene.masks) - scene.exact) < 0.25e-3
 
 
-def test_a_mask_that_reaches_far_beyond_the_mesh_draws_little(scene: Scene) -> None:
+@pytest.mark.parametrize("pixels", [2, 3, 5, 15])
+def test_hair_on_the_upper_half_of_the_head_draws_little(scene: Scene, pixels: int) -> None:
+    """3 to 23 mm of it. Where hair is as thin as fits are off, it must not be taken for their error."""
     import cv2
 
     def hairy(camera: str, row: int) -> tuple[np.ndarray, np.ndarray]:
         label, alpha = (value.copy() for value in scene.masks(camera, row))
-        grown = cv2.dilate(alpha, np.ones((31, 31), np.uint8))
+        grown = cv2.dilate(alpha, np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8))
         alpha[: SIDE // 2], label[: SIDE // 2] = grown[: SIDE // 2], (grown > 0)[: SIDE // 2]
         return label, alpha
 
-    # Fifteen pixels, 23 mm, of hair over the upper half of the head.
-    assert _size(scene.bent(scene.exact, hairy) - scene.exact) < 1e-3
+    assert _size(scene.bent(scene.exact, hairy) - scene.exact) < 0.25e-3
+    # Without hair 0.43 of the error is left; here the outline of one half is not the skin's.
+    assert _size(scene.bent(scene.noisy, hairy) - scene.exact) < 0.6 * _size(scene.noisy - scene.exact)
 
 
 def test_absent_frames_stay_absent(scene: Scene) -> None:
