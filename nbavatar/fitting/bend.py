@@ -12,7 +12,8 @@ and a prior that keeps the coefficients small. Outlines see what all frames shar
 the coefficients of a run of frames have mean zero.
 
 Where the person's outline lies millimetres off a vertex in most views, hair or cloth lies on the skin there. How far,
-is found for each vertex, and taken off: its outline then says only where the vertex is compared to other frames.
+is found for each vertex, and taken off: its outline then says only where the vertex is compared to other frames, and
+the less, the more this distance varies.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +33,7 @@ __all__ = ["bend_block", "smooth_basis"]
 _COLOUR = 0.1  # weight of a vertex' colour: about ten neighbours see the same detail
 _TYPICAL = (0.1, 0.5)  # typical distances of outlines beyond these are not believed: hair is no error of a fit [px]
 _COVER = 2e-3  # a vertex that is farther inside the outline in most views has hair or cloth on it [m]
+_VIEWS = 4  # of fewer views nobody can tell how thick it is
 _ROBUST = 2.5  # distances from an outline of this many typical ones lose three quarters of their weight
 _STRIDE = 5e-4  # a step moves the vertices of a frame by no more, root mean square [m]
 
@@ -202,34 +204,47 @@ def _outline_pulls(placed: np.ndarray, rims: Sequence[Rim], shots: Sequence[Deta
         pixels, slope = (values[rim.frame, rim.vertices] for values in slopes[rim.camera])
         residual, change = rim.residual(pixels)
         told.append((rim, residual, np.einsum("rp,rpx->rx", change, slope)))
-    cover = _cover(told, placed.shape[1])
+    cover, varies = _cover(told, placed.shape[1])
     told = [(rim, residual + cover[rim.vertices] * _length(change), change) for rim, residual, change in told]
     typical = 1.4826 * float(np.median(np.abs(np.concatenate([residual for _, residual, _ in told]))))
     typical = min(max(typical, _TYPICAL[0]), _TYPICAL[1])
     stiff, pull = np.zeros((*placed.shape, 3)), np.zeros(placed.shape)
     for rim, residual, change in told:
-        share = 1.0 / (1.0 + (residual / (_ROBUST * typical)) ** 2) ** 2 / typical**2
+        scale = np.hypot(typical, varies[rim.vertices] * _length(change))
+        share = 1.0 / (1.0 + (residual / (_ROBUST * scale)) ** 2) ** 2 / scale**2
         stiff[rim.frame, rim.vertices] += share[:, None, None] * change[:, :, None] * change[:, None, :]
         pull[rim.frame, rim.vertices] += (share * residual)[:, None] * change
     return Pulls(stiff, pull, typical)
 
 
-def _cover(told: Sequence[tuple[Rim, np.ndarray, np.ndarray]], count: int) -> np.ndarray:
-    """How thick hair or cloth lies on each vertex (V,) [m]: the median over views, 0 where it is below `_COVER`.
+def _cover(told: Sequence[tuple[Rim, np.ndarray, np.ndarray]], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """How thick hair or cloth lies on each vertex (V,) [m]: the median over views, and by how much it varies.
 
     Args:
         told: rims, their vertices' distances outside the outline [px], and how these change with the vertex [px/m].
         count: V.
+
+    Returns:
+        thickness, and 1.4826 times the median distance from it (a metre for fewer than `_VIEWS` views); both 0 where
+        the thickness is below `_COVER`.
     """
     vertex = np.concatenate([rim.vertices for rim, _, _ in told])
     depth = np.concatenate([-residual / np.maximum(_length(change), 1e-9) for _, residual, change in told])
-    order = np.lexsort((depth, vertex))
-    vertex, depth = vertex[order], depth[order]
-    which, first, number = np.unique(vertex, return_index=True, return_counts=True)
-    middle = 0.5 * (depth[first + (number - 1) // 2] + depth[first + number // 2])
-    cover = np.zeros(count)
-    cover[which] = np.where(middle > _COVER, middle, 0.0)
-    return cover
+    which, place, number = np.unique(vertex, return_inverse=True, return_counts=True)
+    middle = _medians(place, depth, number)
+    apart = 1.4826 * _medians(place, np.abs(depth - middle[place]), number)
+    covered = middle > _COVER
+    cover, varies = np.zeros(count), np.zeros(count)
+    cover[which] = np.where(covered, middle, 0.0)
+    varies[which] = np.where(covered, np.where(number < _VIEWS, 1.0, apart), 0.0)
+    return cover, varies
+
+
+def _medians(group: np.ndarray, values: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Median of each group's values; groups are 0 ... G - 1, and `number` (G,) says how many values each has."""
+    values = values[np.lexsort((values, group))]
+    first = np.cumsum(number) - number
+    return np.asarray(0.5 * (values[first + (number - 1) // 2] + values[first + number // 2]))
 
 
 def _length(change: np.ndarray) -> np.ndarray:
