@@ -26,7 +26,7 @@ from nbavatar.fitting.details import Details, colour_pulls, likeness, look
 
 __all__ = ["STILL", "Motion", "align_block", "blocks", "composed", "cross_matrix", "moved", "spread", "summary"]
 
-STILL = 1e-5  # a mean step below this ends a level [m]
+STILL = 1e-5  # a level ends when no frame moves farther than this in a step [m]
 
 
 class Motion(NamedTuple):
@@ -129,7 +129,7 @@ def _align_part(
             step[~there] = 0.0
             step[there] -= step[there].mean(0)
             motion = Motion(composed(step[:, :3], motion.turn), motion.shift + step[:, 3:], np.nan, np.nan)
-            if np.abs(step[:, 3:]).mean() < STILL:
+            if np.abs(step[:, 3:]).max() < STILL:
                 break
     before, after = (_System.of(points, centre, m, levels[-1], weight, alike).typical for m in (rest, motion))
     return motion._replace(before=before, after=after) if after < before else rest._replace(before=before, after=before)

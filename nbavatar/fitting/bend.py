@@ -34,8 +34,9 @@ _COLOUR = 0.1  # weight of a vertex' colour: about ten neighbours see the same d
 _TYPICAL = (0.1, 0.5)  # typical distances of outlines beyond these are not believed: hair is no error of a fit [px]
 _COVER = 2e-3  # a vertex that is farther inside the outline in most views has hair or cloth on it [m]
 _VIEWS = 4  # of fewer views nobody can tell how thick it is
-_ROBUST = 2.5  # distances from an outline of this many typical ones lose three quarters of their weight
-_STRIDE = 5e-4  # a step moves the vertices of a frame by no more, root mean square [m]
+# Distances from an outline of this many typical ones lose three quarters of their weight. Of coarse details more is
+# believed: a frame that is off by much more than the others would otherwise never come back.
+_ROBUST = (6.0, 2.5)
 
 
 class _Field(NamedTuple):
@@ -98,7 +99,7 @@ def bend_block(
     current = {part: points.astype(np.float64) for part, points in verts.items()}
     fields: dict[str, _Field] = {}
     parts: dict[str, _Part] = {}
-    for shots in levels:
+    for shots, robust in zip(levels, _ROBUST, strict=True):
         rims = rims_of(current, faces, labels, cameras, masks, cfg)
         for part, points in verts.items():
             there = np.array([bool(np.isfinite(one).all()) for one in points])
@@ -108,7 +109,7 @@ def bend_block(
                 parts[part] = _prepared(points, there, rest[part], basis[part], cfg)
                 fields[part] = _still(len(points), parts[part].basis.shape[1])
             weight = seen[part][..., parts[part].chosen] & there[None, :, None]
-            fields[part] = _bent(parts[part], fields[part], there, weight, rims[part], shots, cfg)
+            fields[part] = _bent(parts[part], fields[part], there, weight, rims[part], robust, shots, cfg)
             moved_part = parts[part].placed(fields[part], slice(None))
             current[part] = np.where(there[:, None, None], moved_part, np.nan)
     return current
@@ -131,8 +132,8 @@ def _prepared(points: np.ndarray, there: np.ndarray, rest: np.ndarray, basis: np
 
 
 def _bent(
-    part: _Part, field: _Field, there: np.ndarray, weight: np.ndarray, rims: Sequence[Rim], shots: Sequence[Details],
-    cfg: AlignConfig,
+    part: _Part, field: _Field, there: np.ndarray, weight: np.ndarray, rims: Sequence[Rim], robust: float,
+    shots: Sequence[Details], cfg: AlignConfig,
 ) -> _Field:  # fmt: skip
     """Steps on one scale of detail."""
     count, modes = field.bend.shape[:2]
@@ -140,7 +141,7 @@ def _bent(
     rigid = np.repeat([np.radians(cfg.turn_deg) ** -2.0, (1e-3 * cfg.shift_mm) ** -2.0], 3)
     prior = np.concatenate([rigid, np.full(3 * modes, (1e-3 * cfg.bend_mm) ** -2.0)])
     for _ in range(cfg.iterations):
-        matrix, vector = _equations(part, field, weight, rims, shots, alike)
+        matrix, vector = _equations(part, field, weight, rims, robust, shots, alike)
         so_far = np.concatenate([field.motion.turn, field.motion.shift, field.bend.reshape(count, -1)], axis=1)
         step = -np.linalg.solve(matrix + np.diag(prior), (vector + prior * so_far)[..., None])[..., 0]
         step[~there] = 0.0
@@ -148,13 +149,19 @@ def _bent(
             step[there] -= step[there].mean(0)
         motion = Motion(composed(step[:, :3], field.motion.turn), field.motion.shift + step[:, 3:6], np.nan, np.nan)
         field = _Field(motion, field.bend + step[:, 6:].reshape(count, modes, 3))
-        if np.abs(step[there, 3:]).mean() < STILL:
+        if np.abs(step[there, 3:]).max() < STILL:
             break
     return field
 
 
 def _equations(
-    part: _Part, field: _Field, weight: np.ndarray, rims: Sequence[Rim], shots: Sequence[Details], alike: np.ndarray
+    part: _Part,
+    field: _Field,
+    weight: np.ndarray,
+    rims: Sequence[Rim],
+    robust: float,
+    shots: Sequence[Details],
+    alike: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations of rotation, shift and coefficients of every frame: (n, 6 + 3K, 6 + 3K) and (n, 6 + 3K)."""
     from scipy.spatial.transform import Rotation
@@ -164,7 +171,7 @@ def _equations(
     middle = part.centre + field.motion.shift
     local = Rotation.from_rotvec(field.motion.turn).as_matrix() @ part.turn  # from the part's own axes to the world
     colour = colour_pulls(placed[:, part.chosen], shots, weight, alike)
-    outline = _outline_pulls(placed, rims, shots)
+    outline = _outline_pulls(placed, rims, robust, shots)
     size = 6 + 3 * modes
     matrix, vector = np.zeros((count, size, size)), np.zeros((count, size))
     for pulls, which, share in ((colour, part.chosen, _COLOUR), (outline, slice(None), 1.0)):
@@ -194,7 +201,7 @@ def _equations(
     return matrix, vector
 
 
-def _outline_pulls(placed: np.ndarray, rims: Sequence[Rim], shots: Sequence[Details]) -> Pulls | None:
+def _outline_pulls(placed: np.ndarray, rims: Sequence[Rim], robust: float, shots: Sequence[Details]) -> Pulls | None:
     """Where the outlines want the rim vertices to be."""
     if not rims:
         return None
@@ -211,7 +218,7 @@ def _outline_pulls(placed: np.ndarray, rims: Sequence[Rim], shots: Sequence[Deta
     stiff, pull = np.zeros((*placed.shape, 3)), np.zeros(placed.shape)
     for rim, residual, change in told:
         scale = np.hypot(typical, varies[rim.vertices] * _length(change))
-        share = 1.0 / (1.0 + (residual / (_ROBUST * scale)) ** 2) ** 2 / scale**2
+        share = 1.0 / (1.0 + (residual / (robust * scale)) ** 2) ** 2 / scale**2
         stiff[rim.frame, rim.vertices] += share[:, None, None] * change[:, :, None] * change[:, None, :]
         pull[rim.frame, rim.vertices] += (share * residual)[:, None] * change
     return Pulls(stiff, pull, typical)
