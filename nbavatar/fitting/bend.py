@@ -11,9 +11,9 @@ draw at the vertices: their colours (`nbavatar.fitting.details`), the outlines o
 and a prior that keeps the coefficients small. Outlines see what all frames share; colours do not, so without outlines
 the coefficients of a run of frames have mean zero.
 
-Where the person's outline lies millimetres off a vertex in most views, hair or cloth lies on the skin there. How far,
-is found for each vertex, and taken off: its outline then says only where the vertex is compared to other frames, and
-the less, the more this distance varies.
+Where the person's outline lies more than 2 mm outside a vertex in most views, hair or cloth lies on the skin there. Its
+thickness is found once a level, as the median over the views, and taken off; the vertex counts the less, the more the
+distance varies. What all frames share is then seen by the outlines of bare skin alone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,8 +34,9 @@ _COLOUR = 0.1  # weight of a vertex' colour: about ten neighbours see the same d
 _TYPICAL = (0.1, 0.5)  # typical distances of outlines beyond these are not believed: hair is no error of a fit [px]
 _COVER = 2e-3  # a vertex that is farther inside the outline in most views has hair or cloth on it [m]
 _VIEWS = 4  # of fewer views nobody can tell how thick it is
-# Distances from an outline of this many typical ones lose three quarters of their weight. Of coarse details more is
-# believed: a frame that is off by much more than the others would otherwise never come back.
+_SLOPE = 0.5  # an outline's distance must change at least so much with a pixel; beside a ridge it tells no place
+# Distances from an outline of this many typical ones lose three quarters of their weight, on the coarse and on the fine
+# level of detail. More is believed at first: some frames are off by much more than the others.
 _ROBUST = (6.0, 2.5)
 
 
@@ -59,6 +60,24 @@ class _Part(NamedTuple):
         """Vertices after a field, (n, ..., 3) [m]."""
         bent = np.einsum("nij,nvj->nvi", self.turn, self.basis[which] @ field.bend)
         return moved(self.verts[:, which] + bent, field.motion, self.centre)
+
+
+class _Outline(NamedTuple):
+    """What the outlines of a part say on one level.
+
+    Attributes:
+        rims: of `rims_of`.
+        cover: thickness of hair or cloth on each vertex, 0 on bare skin and where no rim is, (V,) [m].
+        varies: 1.4826 times the median deviation from it, 0 on bare skin, (V,) [m].
+        told: whether the outline of a vertex is believed: of covered ones, those of enough views, bool (V,).
+        robust: see `_ROBUST`.
+    """
+
+    rims: Sequence[Rim]
+    cover: np.ndarray
+    varies: np.ndarray
+    told: np.ndarray
+    robust: float
 
 
 def smooth_basis(rest: np.ndarray, faces: np.ndarray, modes: int) -> np.ndarray:
@@ -109,7 +128,8 @@ def bend_block(
                 parts[part] = _prepared(points, there, rest[part], basis[part], cfg)
                 fields[part] = _still(len(points), parts[part].basis.shape[1])
             weight = seen[part][..., parts[part].chosen] & there[None, :, None]
-            fields[part] = _bent(parts[part], fields[part], there, weight, rims[part], robust, shots, cfg)
+            outline = _outline_of(parts[part].placed(fields[part], slice(None)), rims[part], robust, shots)
+            fields[part] = _bent(parts[part], fields[part], there, weight, outline, shots, cfg)
             moved_part = parts[part].placed(fields[part], slice(None))
             current[part] = np.where(there[:, None, None], moved_part, np.nan)
     return current
@@ -132,8 +152,8 @@ def _prepared(points: np.ndarray, there: np.ndarray, rest: np.ndarray, basis: np
 
 
 def _bent(
-    part: _Part, field: _Field, there: np.ndarray, weight: np.ndarray, rims: Sequence[Rim], robust: float,
-    shots: Sequence[Details], cfg: AlignConfig,
+    part: _Part, field: _Field, there: np.ndarray, weight: np.ndarray, outline: _Outline, shots: Sequence[Details],
+    cfg: AlignConfig,
 ) -> _Field:  # fmt: skip
     """Steps on one scale of detail."""
     count, modes = field.bend.shape[:2]
@@ -141,11 +161,11 @@ def _bent(
     rigid = np.repeat([np.radians(cfg.turn_deg) ** -2.0, (1e-3 * cfg.shift_mm) ** -2.0], 3)
     prior = np.concatenate([rigid, np.full(3 * modes, (1e-3 * cfg.bend_mm) ** -2.0)])
     for _ in range(cfg.iterations):
-        matrix, vector = _equations(part, field, weight, rims, robust, shots, alike)
+        matrix, vector = _equations(part, field, weight, outline, shots, alike)
         so_far = np.concatenate([field.motion.turn, field.motion.shift, field.bend.reshape(count, -1)], axis=1)
         step = -np.linalg.solve(matrix + np.diag(prior), (vector + prior * so_far)[..., None])[..., 0]
         step[~there] = 0.0
-        if not rims:
+        if not outline.rims:
             step[there] -= step[there].mean(0)
         motion = Motion(composed(step[:, :3], field.motion.turn), field.motion.shift + step[:, 3:6], np.nan, np.nan)
         field = _Field(motion, field.bend + step[:, 6:].reshape(count, modes, 3))
@@ -155,13 +175,7 @@ def _bent(
 
 
 def _equations(
-    part: _Part,
-    field: _Field,
-    weight: np.ndarray,
-    rims: Sequence[Rim],
-    robust: float,
-    shots: Sequence[Details],
-    alike: np.ndarray,
+    part: _Part, field: _Field, weight: np.ndarray, outline: _Outline, shots: Sequence[Details], alike: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations of rotation, shift and coefficients of every frame: (n, 6 + 3K, 6 + 3K) and (n, 6 + 3K)."""
     from scipy.spatial.transform import Rotation
@@ -171,10 +185,10 @@ def _equations(
     middle = part.centre + field.motion.shift
     local = Rotation.from_rotvec(field.motion.turn).as_matrix() @ part.turn  # from the part's own axes to the world
     colour = colour_pulls(placed[:, part.chosen], shots, weight, alike)
-    outline = _outline_pulls(placed, rims, robust, shots)
+    border = _outline_pulls(placed, outline, shots)
     size = 6 + 3 * modes
     matrix, vector = np.zeros((count, size, size)), np.zeros((count, size))
-    for pulls, which, share in ((colour, part.chosen, _COLOUR), (outline, slice(None), 1.0)):
+    for pulls, which, share in ((colour, part.chosen, _COLOUR), (border, slice(None), 1.0)):
         if pulls is None:
             continue
         arm = placed[:, which] - middle[:, None]
@@ -201,50 +215,62 @@ def _equations(
     return matrix, vector
 
 
-def _outline_pulls(placed: np.ndarray, rims: Sequence[Rim], robust: float, shots: Sequence[Details]) -> Pulls | None:
-    """Where the outlines want the rim vertices to be."""
-    if not rims:
-        return None
+def _outline_of(placed: np.ndarray, rims: Sequence[Rim], robust: float, shots: Sequence[Details]) -> _Outline:
+    """The outlines of a part, and how thick hair or cloth lies on its vertices, at the start of a level.
+
+    Args:
+        placed: vertices (n, V, 3) [m]; robust: see `_ROBUST`.
+    """
+    cover, varies, told = (np.zeros(placed.shape[1]) for _ in range(3))
+    views = [(rim.vertices, -residual, _length(change)) for rim, residual, change in _distances(placed, rims, shots)]
+    if views:
+        vertex, inside, slope = (np.concatenate(values) for values in zip(*views, strict=True))
+        which, place, number = np.unique(vertex, return_inverse=True, return_counts=True)
+        depth = inside / slope
+        middle = _medians(place, depth, number)
+        covered = middle > _COVER
+        cover[which] = np.where(covered, middle, 0.0)
+        varies[which] = np.where(covered, 1.4826 * _medians(place, np.abs(depth - middle[place]), number), 0.0)
+        told[which] = ~covered | (number >= _VIEWS)
+    return _Outline(rims, cover, varies, told > 0, robust)
+
+
+def _distances(
+    placed: np.ndarray, rims: Sequence[Rim], shots: Sequence[Details]
+) -> list[tuple[Rim, np.ndarray, np.ndarray]]:
+    """Rims, how far each vertex is outside the outline [px], and its change with the vertex (R, 3) [px/m].
+
+    Vertices beside a ridge of the distance map, between two locks of hair for example, are left out.
+    """
     slopes = [projected(placed, shot) for shot in shots]
-    told = []
+    result = []
     for rim in rims:
         pixels, slope = (values[rim.frame, rim.vertices] for values in slopes[rim.camera])
         residual, change = rim.residual(pixels)
-        told.append((rim, residual, np.einsum("rp,rpx->rx", change, slope)))
-    cover, varies = _cover(told, placed.shape[1])
-    told = [(rim, residual + cover[rim.vertices] * _length(change), change) for rim, residual, change in told]
-    typical = 1.4826 * float(np.median(np.abs(np.concatenate([residual for _, residual, _ in told]))))
+        clear = _length(change) > _SLOPE
+        if clear.any():
+            few = rim._replace(vertices=rim.vertices[clear], own=rim.own[clear])
+            result.append((few, residual[clear], np.einsum("rp,rpx->rx", change[clear], slope[clear])))
+    return result
+
+
+def _outline_pulls(placed: np.ndarray, outline: _Outline, shots: Sequence[Details]) -> Pulls | None:
+    """Where the outlines want the rim vertices to be."""
+    told = []
+    for rim, residual, change in _distances(placed, outline.rims, shots):
+        told.append((rim, residual + outline.cover[rim.vertices] * _length(change), change))
+    if not told:
+        return None
+    bare = np.concatenate([residual[outline.cover[rim.vertices] == 0] for rim, residual, _ in told])
+    typical = 1.4826 * float(np.median(np.abs(bare))) if bare.size else _TYPICAL[1]
     typical = min(max(typical, _TYPICAL[0]), _TYPICAL[1])
     stiff, pull = np.zeros((*placed.shape, 3)), np.zeros(placed.shape)
     for rim, residual, change in told:
-        scale = np.hypot(typical, varies[rim.vertices] * _length(change))
-        share = 1.0 / (1.0 + (residual / (robust * scale)) ** 2) ** 2 / scale**2
+        scale = np.hypot(typical, outline.varies[rim.vertices] * _length(change))
+        share = outline.told[rim.vertices] / (1.0 + (residual / (outline.robust * scale)) ** 2) ** 2 / scale**2
         stiff[rim.frame, rim.vertices] += share[:, None, None] * change[:, :, None] * change[:, None, :]
         pull[rim.frame, rim.vertices] += (share * residual)[:, None] * change
     return Pulls(stiff, pull, typical)
-
-
-def _cover(told: Sequence[tuple[Rim, np.ndarray, np.ndarray]], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """How thick hair or cloth lies on each vertex (V,) [m]: the median over views, and by how much it varies.
-
-    Args:
-        told: rims, their vertices' distances outside the outline [px], and how these change with the vertex [px/m].
-        count: V.
-
-    Returns:
-        thickness, and 1.4826 times the median distance from it (a metre for fewer than `_VIEWS` views); both 0 where
-        the thickness is below `_COVER`.
-    """
-    vertex = np.concatenate([rim.vertices for rim, _, _ in told])
-    depth = np.concatenate([-residual / np.maximum(_length(change), 1e-9) for _, residual, change in told])
-    which, place, number = np.unique(vertex, return_inverse=True, return_counts=True)
-    middle = _medians(place, depth, number)
-    apart = 1.4826 * _medians(place, np.abs(depth - middle[place]), number)
-    covered = middle > _COVER
-    cover, varies = np.zeros(count), np.zeros(count)
-    cover[which] = np.where(covered, middle, 0.0)
-    varies[which] = np.where(covered, np.where(number < _VIEWS, 1.0, apart), 0.0)
-    return cover, varies
 
 
 def _medians(group: np.ndarray, values: np.ndarray, number: np.ndarray) -> np.ndarray:

@@ -224,12 +224,14 @@ def _in_neck(points: np.ndarray, verts: np.ndarray, faces: np.ndarray, radius: f
     centre = largest.mean(0)
     ring = largest - centre
     normal = np.cross(ring, np.roll(ring, -1, 0)).sum(0)
+    if not normal.any():
+        return np.zeros(len(points), bool)
     normal /= np.linalg.norm(normal)
     normal = normal if normal @ (verts.mean(0) - centre) < 0 else -normal
     inside = (points - centre) @ normal > 0
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     axes = np.stack([across, np.cross(normal, across)], 1)
-    # The outline in polar coordinates about its centre, which sees all of a neck's.
+    # The outline in polar coordinates about its centre, from which all of a neck's can be seen.
     direction, distance = _polar(ring @ axes)
     towards, away = _polar((points[inside] - centre) @ axes)
     inside[inside] = away < np.interp(towards, direction, distance, period=2.0 * np.pi) + around

@@ -47,8 +47,14 @@ def loose_hair(style: str) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         vertices (V, 3) [m] from the origin between the eyes, and faces (F, 3), counter-clockwise seen from outside;
         without elements where a style has none.
+
+    Raises:
+        KeyError: an unknown style.
     """
-    lines = {"ponytail": (_PONYTAIL,), "long": (_LEFT_LOCK, _RIGHT_LOCK, *_curtain())}.get(style, ())
+    none = ()
+    lines = {"cap": none, "beard": none, "ponytail": (_PONYTAIL,), "long": (_LEFT_LOCK, _RIGHT_LOCK, *_curtain())}[
+        style
+    ]
     verts, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for line in lines:
         tube_verts, tube_faces = _tube(np.array(line))
@@ -73,8 +79,8 @@ def beard(points: np.ndarray) -> np.ndarray:
 
 
 def _curtain() -> list[list[tuple[float, float, float, float]]]:
-    """Centre lines and radii of the locks at the back [mm]; every other one ends a little higher."""
-    # height, half axes of the ellipse about the head's middle on which they hang, radius
+    """Centre lines and radii of the locks at the back [mm]; every other one hangs a little higher."""
+    # height, half axes across and to the back of the ellipse about the head's middle on which they hang, radius
     rows = (
         (62, 58, 66, 9),
         (15, 76, 82, 14),

@@ -108,6 +108,48 @@ def test_hair_on_the_upper_half_of_the_head_draws_little(scene: Scene, pixels: i
     assert _size(scene.bent(scene.noisy, hairy) - scene.exact) < 0.6 * _size(scene.noisy - scene.exact)
 
 
+def test_masks_that_are_too_wide_everywhere_do_not_draw_what_all_frames_share(scene: Scene) -> None:
+    """By 6 and 9 mm, which count as cloth: of the shared error nothing is known then, and it must not grow."""
+    import cv2
+
+    for pixels in (4, 6):
+
+        def wide(camera: str, row: int, size: int = 2 * pixels + 1) -> tuple[np.ndarray, np.ndarray]:
+            alpha = cv2.dilate(scene.masks(camera, row)[1], np.ones((size, size), np.uint8))
+            return (alpha > 0).astype(np.uint8), alpha
+
+        left = (scene.bent(scene.noisy, wide) - scene.exact).mean(0)
+        assert _size(left) < 1.1 * _size(scene.shared)
+
+
+def test_thickness_of_hair_is_the_median_of_enough_views(scene: Scene) -> None:
+    import cv2
+
+    def hairy(camera: str, row: int) -> tuple[np.ndarray, np.ndarray]:
+        size = 2 * (4 + row % 3) + 1  # 4, 5 or 6 pixels
+        alpha = cv2.dilate(scene.masks(camera, row)[1], np.ones((size, size), np.uint8))
+        return (alpha > 0).astype(np.uint8), alpha
+
+    rims = rims_of({"head": scene.exact}, {"head": scene.faces}, {"head": 1}, scene.cameras, hairy, CONFIG)["head"]
+    _, levels = look({"head": scene.exact}, {"head": scene.faces}, scene.cameras, scene.read, CONFIG)
+    outline = bend._outline_of(scene.exact, rims, ROBUST, levels[-1])
+    depths: dict[int, list[float]] = {}
+    for rim, residual, change in bend._distances(scene.exact, rims, levels[-1]):
+        for vertex, value in zip(rim.vertices, -residual / np.linalg.norm(change, axis=1), strict=True):
+            depths.setdefault(int(vertex), []).append(value)
+    assert depths and max(map(len, depths.values())) > 4
+    for vertex in range(len(outline.cover)):
+        values = depths.get(vertex, [])
+        middle = np.median(values) if values else 0.0
+        thick = middle > bend._COVER
+        assert outline.cover[vertex] == pytest.approx(middle if thick else 0.0)
+        spread = 1.4826 * np.median(np.abs(values - middle)) if thick else 0.0
+        assert outline.varies[vertex] == pytest.approx(spread)
+        assert outline.told[vertex] == (bool(values) and (not thick or len(values) >= 4))
+    often = [v for v, values in depths.items() if len(values) > 4]
+    assert 4e-3 < np.median(outline.cover[often]) < 10e-3 and np.median(outline.varies[often]) > 0.5e-3
+
+
 def test_a_frame_that_is_off_by_more_than_the_others_comes_back(scene: Scene) -> None:
     """By outlines alone, in pictures without details: one frame is 4.5 mm off, three pixels, the others 1.2 mm."""
     towards = np.random.default_rng(5).normal(size=(FRAMES, 1, 3))
@@ -139,8 +181,10 @@ def test_equations_are_the_gradient_of_their_energy(scene: Scene) -> None:
     field = bend._still(FRAMES, MODES)
     nothing = np.zeros((len(scene.cameras), FRAMES, len(part.chosen)))
     alike = likeness(part.verts[:, part.chosen], 0.01)
-    _, vector = bend._equations(part, field, nothing, rims, ROBUST, levels[-1], alike)
-    typical = bend._outline_pulls(part.verts, rims, ROBUST, levels[-1]).typical
+    bare = np.zeros(scene.noisy.shape[1])
+    outline = bend._Outline(rims, bare, bare, bare == 0, ROBUST)
+    _, vector = bend._equations(part, field, nothing, outline, levels[-1], alike)
+    typical = bend._outline_pulls(part.verts, outline, levels[-1]).typical
 
     def energy(numbers: np.ndarray) -> float:
         motion = Motion(numbers[:, :3], numbers[:, 3:6], np.nan, np.nan)

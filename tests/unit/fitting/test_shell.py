@@ -12,7 +12,7 @@ from nbavatar.config.geometry import ShellConfig
 from nbavatar.data.sequences import Part
 from nbavatar.fitting.evidence import Lens, evidence_of
 from nbavatar.fitting.hull import BACKGROUND, NOTHING, PART, UNEXPLAINED, Silhouette, count_views, grid_over
-from nbavatar.fitting.shell import Shell, carried, carve_shell, rest_of, ride
+from nbavatar.fitting.shell import Shell, _in_neck, carried, carve_shell, rest_of, ride
 from nbavatar.mesh.zbuffer import rasterize_mesh
 
 SIZE, FRAMES = 160, 4
@@ -186,6 +186,20 @@ def test_shell_rides_with_the_skull_and_takes_the_skins_motion_along() -> None:
     assert np.abs(carried(*parts, solid.verts).verts - exact).max() < 1e-5
 
 
+def test_the_neck_goes_on_below_an_open_border_and_nowhere_else() -> None:
+    """A ball that is cut open, turned and scaled: below the cut, as far around as is said, not beside or above it."""
+    ball = trimesh.creation.icosphere(3, radius=1.0)
+    faces = np.asarray(ball.faces)[(ball.vertices[ball.faces][..., 1] > -0.8).all(1)]
+    # The border's vertices lie 0.5 to 0.7 from its middle.
+    points = np.array([[0, -1.5, 0], [0, 0.0, 0], [0.75, -1.5, 0], [1.1, -1.5, 0], [0, -1.5, 1.1]])
+    turn = Rotation.from_euler("xyz", [30, -50, 70], degrees=True).as_matrix()
+    for scale in (1.0, 0.1):
+        verts, placed = scale * ball.vertices @ turn.T, scale * points @ turn.T
+        found = _in_neck(placed, verts, faces, scale, scale * 0.3)
+        assert found.tolist() == [True, False, True, False, False]
+    assert not _in_neck(points, ball.vertices, np.asarray(ball.faces), 1.0, 0.3).any()  # no border
+
+
 def _away(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Distance of points from a surface, by libigl."""
     import igl
@@ -193,8 +207,8 @@ def _away(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> np.ndarra
     return np.sqrt(igl.point_mesh_squared_distance(np.asarray(points), verts, faces.astype(np.int64))[0])
 
 
-@pytest.mark.parametrize(("hair", "tolerance"), [("cap", 0.0), ("ponytail", 5e-3), ("long", 5e-3)])
-def test_loose_hair_of_a_synthetic_subject_is_found_to_millimetres(hair: str, tolerance: float) -> None:
+@pytest.mark.parametrize("hair", ["cap", "ponytail", "long"])
+def test_loose_hair_of_a_synthetic_subject_is_found_to_millimetres(hair: str) -> None:
     """A subject in contact, whose hair stands off the head: labels drawn from what the cameras would see.
 
     A pixel is 3.5 mm wide there, a cell 3 mm, the pose a millimetre off; most cameras have the head before a ponytail.
@@ -248,4 +262,4 @@ def test_loose_hair_of_a_synthetic_subject_is_found_to_millimetres(hair: str, to
             np.median(_away(found, true, faces)),
             _away(points[off], found, shell.faces).mean(),
         ]
-    assert np.max(list(distances.values())) < tolerance, distances
+    assert np.max(list(distances.values())) < 5e-3, distances
