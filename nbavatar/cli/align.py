@@ -13,8 +13,9 @@ and writes
 
 With {"modes": 12} parts are bent too, by smooth functions on their surface, to where colours and the outlines of the
 masks agree: the error of a fit that no motion as a whole takes out. Errors that all frames share are seen by outlines
-only; without masks, and without `modes`, they stay. With {"frames": "train"} frames held out for self-reenactment keep
-the meshes they came with.
+of bare skin only; without masks, and without `modes`, they stay. Where an outline lies more than 2 mm outside a vertex
+in most views, hair or cloth lies there, whose thickness is taken off. With {"frames": "train"} frames held out for
+self-reenactment keep the meshes they came with.
 
 A part has to keep its colours while it moves a little, and to be seen in two frames or more.
 """

@@ -91,7 +91,7 @@ def main(args: argparse.Namespace) -> None:
                 out.add("label", frame, label)
                 out.add("alpha", frame, alpha)
             record["pixels"] = dataclasses.asdict(statistics)
-            out.manifest["unseen"] = statistics.unseen > 0
+            out.manifest |= {"unseen": statistics.unseen > 0, "keep": cfg.keep}
             if statistics.labelled == 0:
                 raise DataError.of(
                     args.frames, f"camera {camera.name}", expected="pixels of a head or a hand in a frame at least",

@@ -117,7 +117,9 @@ def _carved(sequence: MeshSequence, packs: list[FramePack], cfg: ShellConfig) ->
         world_from_rest[:3, :3], world_from_rest[:3, 3] = rest.rotation[row], rest.shift[row]
         return Silhouette(evidence, lenses[index].K, pose @ world_from_rest)
 
-    shell = carve_shell(rest, head.faces, [row for _, row in views], view, cfg)
+    # The shoulders of a whole person are no hair.
+    whole = any(pack.manifest.get("keep") == "person" for pack in packs)
+    shell = carve_shell(rest, head.faces, [row for _, row in views], view, cfg, above_neck=whole)
     if len(shell.faces):  # the skin's own motion, contact too
         rest = rest._replace(verts=rest_of(head.rest, head.faces, head.verts, rows).verts)
     return shell, rest

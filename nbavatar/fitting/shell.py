@@ -115,6 +115,8 @@ def carve_shell(
     rows: Sequence[int],
     view: Callable[[int], Silhouette],
     cfg: ShellConfig,
+    *,
+    above_neck: bool = False,
 ) -> Shell:
     """Finds what reaches beyond the mesh.
 
@@ -124,6 +126,7 @@ def carve_shell(
         rows: frame of each view.
         view: makes the silhouette of a view (its position in `rows`).
         cfg: options.
+        above_neck: leave out all that lies below the end of the mesh's neck, not only where the neck itself goes on.
 
     Returns:
         the surface; an empty one where nothing reaches out, where there are no views, or where they are too alike.
@@ -141,7 +144,7 @@ def carve_shell(
         grid = grid_over(low, high, edge * rest.radius, cfg.cells)
         order = _interleaved(len(rows))
         counts = count_views(grid, (view(i) for i in order), len(rows), cfg.misses)
-        found = _cells(grid, counts, mesh, rest, faces, len(rows), cfg)
+        found = _cells(grid, counts, mesh, rest, faces, len(rows), cfg, np.inf if above_neck else cfg.reach)
         if not found.kept.any():
             return Shell(*nothing, {**said, "absent": "nothing reaches beyond the mesh"})
         box = np.argwhere(found.kept)
@@ -180,9 +183,10 @@ class _Cells(NamedTuple):
 
 
 def _cells(
-    grid: Grid, counts: Counts, mesh: DeformingMesh, rest: Rest, faces: np.ndarray, views: int, cfg: ShellConfig
-) -> _Cells:
-    """Hull of the counts, and of it what reaches beyond the mesh."""
+    grid: Grid, counts: Counts, mesh: DeformingMesh, rest: Rest, faces: np.ndarray, views: int, cfg: ShellConfig,
+    around: float,
+) -> _Cells:  # fmt: skip
+    """Hull of the counts, and of it what reaches beyond the mesh; `around` the neck's end nothing is kept [radius]."""
     import scipy.ndimage
 
     seen = counts.seen.astype(np.float64)
@@ -194,7 +198,7 @@ def _cells(
     height, _, _ = mesh.signed(np.ascontiguousarray(centres), np.inf)
     beyond = np.zeros(grid.count, bool)
     core = np.zeros(grid.count, bool)
-    above = ~_in_neck(centres, rest.verts, faces, rest.radius, cfg.reach * rest.radius)
+    above = ~_in_neck(centres, rest.verts, faces, rest.radius, around * rest.radius)
     beyond[hull] = (height > cfg.gap * rest.radius) & above
     explained = counts.unexplained.ravel()[hull] < np.maximum(cfg.support * seen.ravel()[hull], 1.0)
     core[hull] = (height > cfg.reach * rest.radius) & ~explained & above

@@ -29,6 +29,7 @@ def labels(folder, **cfg):
     words = ["--frames", str(folder / "left.zip"), "--meshes", str(folder / "t.npz"), "--out", str(folder / "m.zip")]
     assert main(["masks", *words, "--cfg", json.dumps({"forearm_length": 0.0, **cfg})]) == 0
     with FramePack(folder / "m.zip") as pack:
+        assert pack.manifest["keep"] == cfg.get("keep", "parts")  # `shell` takes no shoulders for hair
         return {frame: pack.read("label", frame) for frame in pack.frames}
 
 

@@ -197,6 +197,7 @@ def test_the_neck_goes_on_below_an_open_border_and_nowhere_else() -> None:
         verts, placed = scale * ball.vertices @ turn.T, scale * points @ turn.T
         found = _in_neck(placed, verts, faces, scale, scale * 0.3)
         assert found.tolist() == [True, False, True, False, False]
+    assert _in_neck(points, ball.vertices, faces, 1.0, np.inf).tolist() == [True, False, True, True, True]
     assert not _in_neck(points, ball.vertices, np.asarray(ball.faces), 1.0, 0.3).any()  # no border
 
 
