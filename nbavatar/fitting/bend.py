@@ -221,18 +221,23 @@ def _outline_of(placed: np.ndarray, rims: Sequence[Rim], robust: float, shots: S
     Args:
         placed: vertices (n, V, 3) [m]; robust: see `_ROBUST`.
     """
-    cover, varies, told = (np.zeros(placed.shape[1]) for _ in range(3))
+    import scipy.ndimage
+
+    cover, varies = np.zeros(placed.shape[1]), np.zeros(placed.shape[1])
+    told = np.zeros(placed.shape[1], bool)
     views = [(rim.vertices, -residual, _length(change)) for rim, residual, change in _distances(placed, rims, shots)]
     if views:
         vertex, inside, slope = (np.concatenate(values) for values in zip(*views, strict=True))
         which, place, number = np.unique(vertex, return_inverse=True, return_counts=True)
         depth = inside / slope
-        middle = _medians(place, depth, number)
+        groups = np.arange(len(which))
+        middle = scipy.ndimage.median(depth, place, groups)
         covered = middle > _COVER
         cover[which] = np.where(covered, middle, 0.0)
-        varies[which] = np.where(covered, 1.4826 * _medians(place, np.abs(depth - middle[place]), number), 0.0)
+        deviation = scipy.ndimage.median(np.abs(depth - middle[place]), place, groups)
+        varies[which] = np.where(covered, 1.4826 * deviation, 0.0)
         told[which] = ~covered | (number >= _VIEWS)
-    return _Outline(rims, cover, varies, told > 0, robust)
+    return _Outline(rims, cover, varies, told, robust)
 
 
 def _distances(
@@ -242,7 +247,7 @@ def _distances(
 
     Vertices beside a ridge of the distance map, between two locks of hair for example, are left out.
     """
-    slopes = [projected(placed, shot) for shot in shots]
+    slopes = [projected(placed, shot) for shot in shots] if rims else []
     result = []
     for rim in rims:
         pixels, slope = (values[rim.frame, rim.vertices] for values in slopes[rim.camera])
@@ -271,13 +276,6 @@ def _outline_pulls(placed: np.ndarray, outline: _Outline, shots: Sequence[Detail
         stiff[rim.frame, rim.vertices] += share[:, None, None] * change[:, :, None] * change[:, None, :]
         pull[rim.frame, rim.vertices] += (share * residual)[:, None] * change
     return Pulls(stiff, pull, typical)
-
-
-def _medians(group: np.ndarray, values: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Median of each group's values; groups are 0 ... G - 1, and `number` (G,) says how many values each has."""
-    values = values[np.lexsort((values, group))]
-    first = np.cumsum(number) - number
-    return np.asarray(0.5 * (values[first + (number - 1) // 2] + values[first + number // 2]))
 
 
 def _length(change: np.ndarray) -> np.ndarray:

@@ -5,6 +5,8 @@ Lengths in the tables are millimetres from the origin between the eyes: x to the
 
 import numpy as np
 
+from nbavatar.mesh.zbuffer import joined_meshes
+
 __all__ = ["beard", "loose_hair"]
 
 # Centre line and radius of the ponytail: from the back of the head outwards, then down behind the left shoulder.
@@ -51,17 +53,10 @@ def loose_hair(style: str) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         KeyError: an unknown style.
     """
-    none = ()
-    lines = {"cap": none, "beard": none, "ponytail": (_PONYTAIL,), "long": (_LEFT_LOCK, _RIGHT_LOCK, *_curtain())}[
-        style
-    ]
-    verts, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
-    for line in lines:
-        tube_verts, tube_faces = _tube(np.array(line))
-        verts.append(tube_verts)
-        faces.append(tube_faces + count)
-        count += len(tube_verts)
-    return np.concatenate(verts), np.concatenate(faces)
+    lines = {"cap": [], "beard": [], "ponytail": [_PONYTAIL], "long": [_LEFT_LOCK, _RIGHT_LOCK, *_curtain()]}[style]
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    verts, faces, _ = joined_meshes([nothing, *(_tube(np.array(line)) for line in lines)])
+    return verts, faces
 
 
 def beard(points: np.ndarray) -> np.ndarray:
