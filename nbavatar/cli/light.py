@@ -70,8 +70,8 @@ def main(args: argparse.Namespace) -> None:
         chosen = _evenly(list(packs), cfg.cameras)
         scene = _Scene(sequence, [packs[name] for name in chosen], [masks[name] for name in chosen], cfg)
         directions = sphere_directions(cfg.directions)
-        incident, seen = scene.look(directions)
-        light, said = estimate_light(incident, seen, directions, kept=cfg.lights, least=cfg.least)
+        seen = scene.look()
+        light, said = estimate_light(scene.reach, seen, directions, kept=cfg.lights, least=cfg.least)
         inputs = {"meshes": args.meshes} | {f"frames.{i}": path for i, path in enumerate(args.frames)}
         inputs |= {f"masks.{i}": path for i, path in enumerate(args.masks)}
         write_light(args.out, light, run_record("light", config=to_mapping(cfg), inputs=inputs, extra={"light": said}))
@@ -109,13 +109,24 @@ class _Scene:
         self._place = np.full(count, -1)
         self._place[self._faces] = np.arange(len(self._faces))
 
-    def look(self, directions: np.ndarray) -> tuple[np.ndarray, Brightness]:
-        """Incidence float32 (N, K, F) and brightness of the chosen faces in the chosen frames."""
+    def look(self) -> Brightness:
+        """Brightness of the chosen faces in the chosen frames."""
         shape = len(self._rows), len(self._faces)
         seen = Brightness(np.zeros(shape), np.zeros(shape))
-        incident = np.zeros((shape[0], len(directions), shape[1]), np.float32)
-        for n, row in enumerate(progress(self._rows, "light", len(self._rows))):
+        for n, row in enumerate(progress(self._rows, "brightness", len(self._rows))):
             frame = self._sequence.frames[row]
+            verts, faces, numbers = self._meshes(row)
+            for index in range(len(self._packs)):
+                if frame not in self._packs[index].split("train"):
+                    continue
+                face, image, usable = self._shot(index, frame, verts, faces, numbers)
+                add_picture(seen, n, image, usable, face, self._place[numbers])
+        return seen
+
+    def reach(self, directions: np.ndarray) -> np.ndarray:
+        """Incidence of far lights (K, 3) on the chosen faces in the chosen frames, float32 (N, K, F)."""
+        incident = np.zeros((len(self._rows), len(directions), len(self._faces)), np.float32)
+        for n, row in enumerate(progress(self._rows, f"shadows of {len(directions)} lights", len(self._rows))):
             verts, faces, numbers = self._meshes(row)
             place = self._place[numbers]
             lit = np.flatnonzero(place >= 0)
@@ -123,12 +134,7 @@ class _Scene:
             incident[n][:, place[lit]] = incidence(
                 verts, faces[lit], normals, directions, occluders=faces, side=self._side
             )
-            for index in range(len(self._packs)):
-                if frame not in self._packs[index].split("train"):
-                    continue
-                face, image, usable = self._shot(index, frame, verts, faces, numbers)
-                add_picture(seen, n, image, usable, face, place)
-        return incident, seen
+        return incident
 
     def shots(self, light: Light, count: int) -> list[Shot]:
         """Photographs of the first camera, spread over its frames, with the meshes' shading in each."""

@@ -10,14 +10,21 @@ in, a quadratic form in w, and its smallest value among w >= 0 of a given sum is
 favours lights that change little; from there on a and w are found in turns by least squares of I - a S. What a camera
 adds by its own place (gloss) counts as noise.
 
+A lamp throws sharp shadows from one direction, and lights evenly spread over the sphere are far from it: 6 degrees, for
+256 of them, move the shadow of a finger by a finger's width. So the strongest lights get neighbours at half their
+distance, all are fitted again, and once more at a quarter of it.
+
+Faces whose brightness no light explains are left out of the fit: eyes that look around, skin that hair slides over.
+
 Whether there is such a light is judged by frames that took no part: fitted to two of three frames, it has to explain
 how bright the others are better than the mean brightness of each face does. Faces that hardly any light reaches in the
-frames of the fit are left out: their albedo cannot be told.
+frames of the fit are not judged: their albedo cannot be told.
 
 Brightness is that of linear light (sRGB's transfer function undone, IEC 61966-2-1), mean over red, green and blue:
 coloured lights are taken for grey ones.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +46,12 @@ _RIDGE, _LOOSE = (
 )  # pull towards equal lights all around, of the mean curvature: at first, and among those kept
 _CONVEX, _TURNS = 3, 8  # rounds of the convex problem, and of a and w in turns
 _ROBUST = 1.0  # misfit, in units of S, at which a reading has half its weight
+_UNSTEADY = 3.0  # faces whose misfit is so many times the typical one do not show light
+_HALVINGS = 2  # of the distance between lights, around the strongest
+_STRONG = 4.0  # strength from which a light gets neighbours, in units of an equal share of all lights tried
+_REFINED = 16  # most lights that get neighbours in a round
+_CARRIED = 96  # most lights that a round hands on
+_LEFT = 1e-4  # strength below which a light is none
 _SUM = 4.0
 
 
@@ -74,14 +87,14 @@ def add_picture(
 
 
 def estimate_light(
-    incident: np.ndarray, seen: Brightness, directions: np.ndarray, *, kept: int, least: float
+    reach: Callable[[np.ndarray], np.ndarray], seen: Brightness, directions: np.ndarray, *, kept: int, least: float
 ) -> tuple[Light, dict[str, Any]]:
     """Far lights that explain how the brightness of faces changes.
 
     Args:
-        incident: incidence of every light, float32 (N, K, F); of a part that is not in a frame, anything.
+        reach: incidence float32 (N, K, F) of lights in directions (K, 3); of a part that is not in a frame, anything.
         seen: brightness of the faces.
-        directions: towards the K lights, unit, world (K, 3).
+        directions: that are tried first, evenly spread over the sphere, unit, world (K, 3).
         kept: most lights that are kept, the strongest.
         least: share of the change, in frames that took no part, that has to be explained for a light to be kept.
 
@@ -92,6 +105,7 @@ def estimate_light(
     weight = np.minimum(seen.pixels, _MOST)
     nothing = Light(np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
     held = np.arange(len(readings)) % 3 == 1
+    incident = reach(directions)
     fold = _Readings.of(incident, readings, weight, ~held)
     said: dict[str, Any] = {"frames": len(readings), "faces": fold.count}
     if len(readings) < _FRAMES or fold.count < _FACES:
@@ -100,21 +114,80 @@ def estimate_light(
             **said,
             "absent": f"{reason}; at least {_FACES} faces and {_FRAMES} frames tell light from skin",
         }
-    every = np.arange(len(directions))
-    explained = _explained(incident, readings, weight, held, _strengths(fold, every, _RIDGE))
+    first = _strengths(fold, np.arange(len(directions)), _RIDGE)
+    told = weight * _steady(incident, readings, weight, ~held, first)
+    tried, incident = _refined(reach, directions, incident, readings, told, ~held)
+    chosen, found = _strongest(_Readings.of(incident, readings, told, ~held), kept)
+    explained = _explained(incident[:, chosen], readings, weight, held, found)
     said["explained"] = round(explained, 4)
     if explained < least:
         return nothing, {
             **said,
             "absent": f"a light that stands still explains {100 * explained:.0f} % of how skin changes",
         }
-    whole = _Readings.of(incident, readings, weight, np.ones(len(readings), bool))
-    strongest = np.sort(np.argsort(-_strengths(whole, every, _RIDGE), kind="stable")[:kept])
-    found = _strengths(whole, strongest, _LOOSE)
-    lit = found > 1e-4 * _SUM
+    chosen, found = _strongest(_Readings.of(incident, readings, told, np.ones(len(readings), bool)), kept)
+    lit = found > _LEFT * _SUM
     found = found[lit] * (_SUM / found[lit].sum())
     said["lights"] = int(lit.sum())
-    return Light(directions[strongest][lit].astype(np.float32), found.astype(np.float32)), said
+    return Light(tried[chosen][lit].astype(np.float32), found.astype(np.float32)), said
+
+
+def _steady(
+    incident: np.ndarray, light: np.ndarray, weight: np.ndarray, rows: np.ndarray, strengths: np.ndarray
+) -> np.ndarray:
+    """Which faces look, in the frames `rows`, as if light alone changed them, bool (F,)."""
+    shine, light, weight = _shine(incident[rows], strengths), light[rows], weight[rows]
+    misfit = light / np.maximum(_albedo(light, weight, shine), 1e-4) - shine
+    size = np.sqrt((weight * misfit**2).sum(0) / np.maximum(weight.sum(0), 1e-12))
+    often = (weight > 0).sum(0) >= _SEEN
+    return np.asarray(size <= _UNSTEADY * np.median(size[often]))
+
+
+def _refined(
+    reach: Callable[[np.ndarray], np.ndarray],
+    directions: np.ndarray,
+    incident: np.ndarray,
+    light: np.ndarray,
+    weight: np.ndarray,
+    rows: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lights that stand closer where it is bright, (K', 3), and their incidence (N, K', F)."""
+    strong = _STRONG * _SUM / len(directions)
+    apart = np.sqrt(4.0 * np.pi / len(directions))
+    ridge = _RIDGE
+    for halving in range(1, _HALVINGS + 1):
+        found = _strengths(_Readings.of(incident, light, weight, rows), np.arange(len(directions)), ridge)
+        order = np.argsort(-found, kind="stable")
+        carried = order[:_CARRIED][found[order[:_CARRIED]] > _LEFT]
+        bright = order[:_REFINED][found[order[:_REFINED]] > strong]
+        new = _neighbours(directions[bright], directions[carried], apart / 2**halving)
+        directions = np.concatenate([directions[carried], new])
+        incident = np.concatenate([incident[:, carried], reach(new)], axis=1) if len(new) else incident[:, carried]
+        ridge = _LOOSE
+    return directions, incident
+
+
+def _neighbours(bright: np.ndarray, known: np.ndarray, angle: float) -> np.ndarray:
+    """Six directions around each of `bright` (B, 3), `angle` [radians] from it; none closer than half of that to one of
+    `known` (K, 3) or to another.
+    """
+    turns = np.arange(6) * (np.pi / 3.0)
+    found: list[np.ndarray] = []
+    for axis in bright:
+        across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+        across /= np.linalg.norm(across)
+        ring = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(axis, across)
+        for direction in np.cos(angle) * axis + np.sin(angle) * ring:
+            if (np.concatenate([known, *(one[None] for one in found)]) @ direction).max() < np.cos(0.5 * angle):
+                found.append(direction)
+    return np.stack(found) if found else np.zeros((0, 3))
+
+
+def _strongest(readings: "_Readings", count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The strongest lights, (count,), and their strengths without the others."""
+    every = np.arange(readings.incident.shape[1])
+    chosen = np.sort(np.argsort(-_strengths(readings, every, _LOOSE), kind="stable")[:count])
+    return chosen, _strengths(readings, chosen, _LOOSE)
 
 
 class _Readings(NamedTuple):
