@@ -10,9 +10,9 @@ in, a quadratic form in w, and its smallest value among w >= 0 of a given sum is
 favours lights that change little; from there on a and w are found in turns by least squares of I - a S. What a camera
 adds by its own place (gloss) counts as noise.
 
-A lamp throws sharp shadows from one direction, and lights evenly spread over the sphere are far from it: 6 degrees, for
-256 of them, move the shadow of a finger by a finger's width. So the strongest lights get neighbours at half their
-distance, all are fitted again, and once more at a quarter of it.
+A lamp throws sharp shadows from one direction, and of 256 lights evenly spread over the sphere the nearest is 5 degrees
+away in the mean, which moves the shadow of a finger by half its width. So the strongest lights get neighbours at half
+their distance, all are fitted again, and once more at a quarter of it.
 
 Faces whose brightness no light explains are left out of the fit: eyes that look around, skin that hair slides over.
 
@@ -50,8 +50,8 @@ _UNSTEADY = 3.0  # faces whose misfit is so many times the typical one do not sh
 _HALVINGS = 2  # of the distance between lights, around the strongest
 _STRONG = 4.0  # strength from which a light gets neighbours, in units of an equal share of all lights tried
 _REFINED = 16  # most lights that get neighbours in a round
-_CARRIED = 96  # most lights that a round hands on
-_LEFT = 1e-4  # strength below which a light is none
+_CARRIED = 96  # most lights that a round hands on, unless more are to be kept
+_LEFT = 1e-4  # share of all light below which a light is none
 _SUM = 4.0
 
 
@@ -116,7 +116,7 @@ def estimate_light(
         }
     first = _strengths(fold, np.arange(len(directions)), _RIDGE)
     told = weight * _steady(incident, readings, weight, ~held, first)
-    tried, incident = _refined(reach, directions, incident, readings, told, ~held)
+    tried, incident = _refined(reach, directions, incident, readings, told, ~held, max(_CARRIED, kept))
     chosen, found = _strongest(_Readings.of(incident, readings, told, ~held), kept)
     explained = _explained(incident[:, chosen], readings, weight, held, found)
     said["explained"] = round(explained, 4)
@@ -139,8 +139,7 @@ def _steady(
     shine, light, weight = _shine(incident[rows], strengths), light[rows], weight[rows]
     misfit = light / np.maximum(_albedo(light, weight, shine), 1e-4) - shine
     size = np.sqrt((weight * misfit**2).sum(0) / np.maximum(weight.sum(0), 1e-12))
-    often = (weight > 0).sum(0) >= _SEEN
-    return np.asarray(size <= _UNSTEADY * np.median(size[often]))
+    return np.asarray(size <= _UNSTEADY * np.median(size[_telling(light, weight)]))
 
 
 def _refined(
@@ -150,15 +149,16 @@ def _refined(
     light: np.ndarray,
     weight: np.ndarray,
     rows: np.ndarray,
+    most: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lights that stand closer where it is bright, (K', 3), and their incidence (N, K', F)."""
+    """Lights that stand closer where it is bright, (K', 3), and their incidence (N, K', F); a round hands on `most`."""
     strong = _STRONG * _SUM / len(directions)
     apart = np.sqrt(4.0 * np.pi / len(directions))
     ridge = _RIDGE
     for halving in range(1, _HALVINGS + 1):
         found = _strengths(_Readings.of(incident, light, weight, rows), np.arange(len(directions)), ridge)
         order = np.argsort(-found, kind="stable")
-        carried = order[:_CARRIED][found[order[:_CARRIED]] > _LEFT]
+        carried = order[:most][found[order[:most]] > _LEFT * _SUM]
         bright = order[:_REFINED][found[order[:_REFINED]] > strong]
         new = _neighbours(directions[bright], directions[carried], apart / 2**halving)
         directions = np.concatenate([directions[carried], new])
@@ -201,13 +201,18 @@ class _Readings(NamedTuple):
     def of(cls, incident: np.ndarray, light: np.ndarray, weight: np.ndarray, rows: np.ndarray) -> "_Readings":
         """Those of the frames `rows` (bool), of faces that are seen often enough and not black."""
         light, weight = light[rows], weight[rows]
-        said = ((weight > 0).sum(0) >= _SEEN) & (_mean(light, weight) > _DARK)
+        said = _telling(light, weight)
         return cls(incident[rows][:, :, said], light[:, said], weight[:, said])
 
     @property
     def count(self) -> int:
         """Number of faces."""
         return self.light.shape[1]
+
+
+def _telling(light: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Which faces are seen often enough and not black, bool (F,)."""
+    return np.asarray(((weight > 0).sum(0) >= _SEEN) & (_mean(light, weight) > _DARK))
 
 
 def _mean(light: np.ndarray, weight: np.ndarray) -> np.ndarray:
