@@ -104,9 +104,11 @@ class _Scene:
             raise DataError.of(where, "split", expected="a training frame with a mesh", found="none")
         self._rows = _evenly(sorted(there), cfg.frames)
         self._labels = np.concatenate([np.full(len(p.faces), _label(name)) for name, p in sequence.parts.items()])
-        count = len(self._labels)
+        # The shell comes last. It is more solid than hair, so it neither tells light nor throws shadows.
+        self._solid = sum(len(part.faces) for name, part in sequence.parts.items() if name != SHELL)
+        count = self._solid
         self._faces = np.sort(np.random.default_rng(0).permutation(count)[: cfg.faces])
-        self._place = np.full(count, -1)
+        self._place = np.full(len(self._labels), -1)
         self._place[self._faces] = np.arange(len(self._faces))
 
     def look(self) -> Brightness:
@@ -132,7 +134,7 @@ class _Scene:
             lit = np.flatnonzero(place >= 0)
             normals = _normals(verts, faces)[lit]
             incident[n][:, place[lit]] = incidence(
-                verts, faces[lit], normals, directions, occluders=faces, side=self._side
+                verts, faces[lit], normals, directions, occluders=faces[numbers < self._solid], side=self._side
             )
         return incident
 
@@ -147,7 +149,10 @@ class _Scene:
             shine = np.ones(len(faces))
             if len(light.weights):
                 normals = _normals(verts, faces)
-                shine = light.weights @ incidence(verts, faces, normals, light.directions, side=self._side)
+                solid = faces[numbers < self._solid]
+                shine = light.weights @ incidence(
+                    verts, faces, normals, light.directions, occluders=solid, side=self._side
+                )
             found.append(Shot(image, np.where(face >= 0, shine[face], np.nan)))
         return found
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nbavatar.config.training import TrainConfig
 from nbavatar.data.lights import Light
-from nbavatar.data.sequences import MeshSequence
+from nbavatar.data.sequences import SHELL, MeshSequence
 from nbavatar.errors import DataError
 from nbavatar.mesh.frames import face_frames
 from nbavatar.mesh.texels import texel_values
@@ -91,8 +91,16 @@ def initial_avatar(
         {part: len(sequence.parts[part].rest) for part in parts},
         billboards,
         refinement=refinement,
-        shading=Shading(light) if shaded and light is not None else None,
+        shading=_shading(sequence, parts, light) if shaded and light is not None else None,
     )
+
+
+def _shading(sequence: MeshSequence, parts: Sequence[str], light: Light) -> Shading:
+    """The light, and what throws shadows: all parts but a shell."""
+    if SHELL not in parts:
+        return Shading(light)
+    faces = {part: torch.from_numpy(np.asarray(sequence.parts[part].faces)) for part in parts}
+    return Shading(light, {**faces, SHELL: faces[SHELL][:0]})
 
 
 def neighbour_graph(avatar: Avatar, sequence: MeshSequence, config: TrainConfig) -> Tensor | None:

@@ -5,7 +5,8 @@ pose that was not trained; the light that reaches the face can, since it is comp
 2 E^(1/2.2) - 1, where E is the light on the face, in units of what a face gets in the mean that nothing hides: on the
 scale of the pictures, and between -1 and little more than 1.
 
-Faces that were pruned away (`nbavatar.methods.billboards.compression`) still throw shadows.
+Faces that were pruned away (`nbavatar.methods.billboards.compression`) still throw shadows. A shell throws none: carved
+from silhouettes it is more solid than hair, and would keep light from skin that is lit between its locks.
 """
 
 import hashlib

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from nbavatar.cli import main
 from nbavatar.data.lights import read_light
-from nbavatar.data.sequences import MeshSequence, Part, write_sequence
+from nbavatar.data.sequences import MeshSequence, Part, read_sequence, write_sequence
 from nbavatar.io.arrays import read_arrays, write_arrays
 from nbavatar.io.framepack import FramePack, FramePackWriter
 from nbavatar.io.images import decode_image
@@ -80,6 +80,22 @@ def test_the_lamp_is_found_and_drawn(studio, tmp_path, capsys) -> None:
     assert ball[12:28, 36:52].mean() > ball[36:52, 12:28].mean() + 20
     once = out.read_bytes()
     assert _light(folder, paths, *words) == 0 and out.read_bytes() == once
+
+
+def test_a_shell_keeps_no_light_from_the_head(studio, tmp_path) -> None:
+    """Locks around the head, half of all directions: skin is seen between them, and is lit as if they were not there."""
+    folder, paths = studio
+    meshes, _ = read_sequence(folder / "meshes.npz")
+    head = meshes.parts["head"]
+    locks = head.faces[np.random.default_rng(0).random(len(head.faces)) < 0.5]
+    parts = {"head": head, "shell": Part(locks, 1.2 * head.rest, 1.2 * head.verts)}
+    write_sequence(tmp_path / "meshes.npz", MeshSequence(meshes.frames, parts, {}), {})
+    words = ["--out", str(tmp_path / "light.npz"), "--set", "lights=16", "--set", "directions=96"]
+    assert _light(tmp_path, paths, *words) == 0
+    light = read_light(tmp_path / "light.npz")
+    mean = light.weights @ light.directions
+    assert mean @ LAMP[0] / np.linalg.norm(mean) > np.cos(np.radians(15.0))
+    assert read_arrays(tmp_path / "light.npz")[1]["light"]["explained"] > 0.8
 
 
 def test_where_nothing_is_seen_there_is_no_light_and_training_goes_on_without(studio, tmp_path, capsys) -> None:

@@ -7,15 +7,19 @@ import pytest
 import torch
 
 from nbavatar.data.lights import Light
+from nbavatar.data.sequences import Part
 from nbavatar.errors import DataError
 from nbavatar.mesh.incidence import incidence, sphere_directions
 from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.compression.reduce import keep_billboards, keep_parts
+from nbavatar.methods.billboards.initial import initial_avatar
 from nbavatar.methods.billboards.refine import Refinement
 from nbavatar.methods.billboards.shading import Shading
 from nbavatar.methods.storage import load_avatar, save_avatar
+from tests.scenes.toy import sequence
 from tests.unit.mesh.shapes import face_normals
 from tests.unit.methods.billboards.test_model import VERTS, make_avatar, render
+from tests.unit.training.test_loop import CONFIG
 
 LIGHT = Light(sphere_directions(5).astype(np.float32), np.array([0.5, 0.0, 1.5, 1.2, 0.8], np.float32))
 # The hand lies between one of the head's faces and the strongest of the lights.
@@ -125,3 +129,29 @@ def test_light_is_stored_with_the_avatar(tmp_path) -> None:
         torch.save(content, tmp_path / "broken.pt")
         with pytest.raises(DataError, match=r"broken\.pt"):
             load_avatar(tmp_path / "broken.pt")
+
+
+def test_a_shell_is_lit_and_throws_no_shadow(tmp_path) -> None:
+    """Carved from silhouettes it is more solid than hair: skin between its locks is lit."""
+    meshes = sequence()
+    coords = {name: 6 * part.rest for name, part in meshes.parts.items()}
+    # A larger head around the head keeps all light from it, if anything does.
+    head = meshes.parts["head"]
+    meshes.parts["shell"] = Part(head.faces, 1.5 * head.rest, 1.5 * head.verts)
+    config = dataclasses.replace(CONFIG, billboards=dataclasses.replace(CONFIG.billboards, shading=True))
+    verts = {name: torch.from_numpy(part.verts[0]) for name, part in meshes.parts.items()}
+    covered = initial_avatar(meshes, coords | {"shell": coords["head"]}, meshes.frames, config, LIGHT)
+    told = _told(covered, verts)[:, -1]
+    del meshes.parts["shell"]
+    bare = _told(initial_avatar(meshes, coords, meshes.frames, config, LIGHT), verts)[:, -1]
+    # The map of shadows spans the shell too, so borders of shadows move by a pixel of it.
+    assert (told[: len(bare)] - bare).abs().mean() < 0.02
+    shell = covered.face_ranges()["shell"]
+    assert (told[shell] > -0.9).any()
+    save_avatar(tmp_path / "model.pt", covered)
+    assert torch.equal(_told(load_avatar(tmp_path / "model.pt"), verts)[:, -1], told)
+    solid = load_avatar(tmp_path / "model.pt")
+    solid.shading = Shading(LIGHT)
+    assert (_told(solid, verts)[: len(bare), -1] - bare).abs().mean() > 0.2
+    kept = torch.arange(1, covered.primitives, 2)
+    torch.testing.assert_close(_told(keep_billboards(covered, kept), verts)[:, -1], told[kept], atol=1e-6, rtol=0)
