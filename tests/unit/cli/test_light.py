@@ -83,7 +83,7 @@ def test_the_lamp_is_found_and_drawn(studio, tmp_path, capsys) -> None:
 
 
 def test_a_shell_keeps_no_light_from_the_head(studio, tmp_path) -> None:
-    """Locks around the head, half of all directions: skin is seen between them, and is lit as if they were not there."""
+    """Locks around the head: skin is seen between them, and is lit as if they were not there."""
     folder, paths = studio
     meshes, _ = read_sequence(folder / "meshes.npz")
     head = meshes.parts["head"]
