@@ -106,8 +106,7 @@ class _Scene:
         self._labels = np.concatenate([np.full(len(p.faces), _label(name)) for name, p in sequence.parts.items()])
         # The shell comes last. It is more solid than hair, so it neither tells light nor throws shadows.
         self._solid = sum(len(part.faces) for name, part in sequence.parts.items() if name != SHELL)
-        count = self._solid
-        self._faces = np.sort(np.random.default_rng(0).permutation(count)[: cfg.faces])
+        self._faces = np.sort(np.random.default_rng(0).permutation(self._solid)[: cfg.faces])
         self._place = np.full(len(self._labels), -1)
         self._place[self._faces] = np.arange(len(self._faces))
 
