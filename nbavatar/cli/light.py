@@ -35,7 +35,8 @@ from nbavatar.fitting.light_picture import Shot, light_picture
 from nbavatar.io.atomic import atomic_write
 from nbavatar.io.framepack import FramePack
 from nbavatar.io.images import encode_png
-from nbavatar.mesh.incidence import incidence, sphere_directions
+from nbavatar.math.directions import sphere_directions
+from nbavatar.mesh.incidence import incidence
 from nbavatar.mesh.zbuffer import joined_meshes, rasterize_mesh
 from nbavatar.preprocess.sources import camera_of
 from nbavatar.provenance import run_record

@@ -31,6 +31,7 @@ import numpy as np
 
 from nbavatar.data.lights import Light
 from nbavatar.io.images import linear_light
+from nbavatar.math.directions import axes_along
 
 __all__ = ["Brightness", "add_picture", "estimate_light"]
 
@@ -173,10 +174,8 @@ def _neighbours(bright: np.ndarray, known: np.ndarray, angle: float) -> np.ndarr
     """
     turns = np.arange(6) * (np.pi / 3.0)
     found: list[np.ndarray] = []
-    for axis in bright:
-        across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        across /= np.linalg.norm(across)
-        ring = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(axis, across)
+    for right, up, axis in axes_along(bright):
+        ring = np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * up
         for direction in np.cos(angle) * axis + np.sin(angle) * ring:
             if (np.concatenate([known, *(one[None] for one in found)]) @ direction).max() < np.cos(0.5 * angle):
                 found.append(direction)

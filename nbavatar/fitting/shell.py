@@ -21,6 +21,7 @@ from nbavatar.config.geometry import ShellConfig
 from nbavatar.data.sequences import Part
 from nbavatar.fitting.hull import Counts, Grid, Silhouette, count_views, grid_over
 from nbavatar.fitting.surface import decimated, face_areas, piece_surface, smoothed
+from nbavatar.math.directions import axes_along
 from nbavatar.mesh.bvh import DeformingMesh
 from nbavatar.mesh.topology import boundary_loops
 
@@ -233,8 +234,7 @@ def _in_neck(points: np.ndarray, verts: np.ndarray, faces: np.ndarray, radius: f
     normal /= np.linalg.norm(normal)
     normal = normal if normal @ (verts.mean(0) - centre) < 0 else -normal
     inside = (points - centre) @ normal > 0
-    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    axes = np.stack([across, np.cross(normal, across)], 1)
+    axes = axes_along(normal[None])[0, :2].T
     # The outline in polar coordinates about its centre, from which all of a neck's can be seen.
     direction, distance = _polar(ring @ axes)
     towards, away = _polar((points[inside] - centre) @ axes)

@@ -1,1 +1,1 @@
-"""Rotations and rigid transforms in torch."""
+"""Rotations and windows over pictures in torch, directions in numpy."""

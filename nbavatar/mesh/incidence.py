@@ -17,25 +17,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from nbavatar.jit.cache import stored_njit
+from nbavatar.math.directions import axes_along
 
-__all__ = ["incidence", "sphere_directions"]
+__all__ = ["incidence"]
 
 _BIAS = 1.5  # depth by which a face may lie behind what its own light sees and still be lit [pixels of the map]
 _STEEPEST = 4.0  # tangent up to which that depth grows with the slant of the face
 _CHUNK = 8  # directions a thread takes at once
-
-
-def sphere_directions(count: int) -> np.ndarray:
-    """Unit vectors spread evenly over the sphere, float64 (count, 3), by a Fibonacci lattice (Gonzalez 2010).
-
-    Args:
-        count: how many, one at least.
-    """
-    place = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * place / count
-    angle = place * np.pi * (3.0 - np.sqrt(5.0))
-    radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
 @stored_njit(nogil=True, error_model="numpy")
@@ -136,7 +124,7 @@ def incidence(
     points = np.ascontiguousarray(verts, np.float64)
     lit = np.ascontiguousarray(faces, np.int64).reshape(-1, 3)
     hiding = lit if occluders is None else np.ascontiguousarray(occluders, np.int64).reshape(-1, 3)
-    axes = _axes(np.asarray(directions, np.float64))
+    axes = axes_along(np.asarray(directions, np.float64))
     out = np.zeros((len(axes), len(lit)))
     if not out.size:
         return out
@@ -160,11 +148,3 @@ def incidence(
         with ThreadPoolExecutor(min(workers, len(jobs))) as pool:
             list(pool.map(lambda job: _light(*job), jobs))
     return out
-
-
-def _axes(directions: np.ndarray) -> np.ndarray:
-    """Right-handed axes (K, 3, 3) whose third is the direction."""
-    helper = np.where(np.abs(directions[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    right = np.cross(helper, directions)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return np.stack([right, np.cross(directions, right), directions], axis=1)

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 from nbavatar.data.lights import Light
 from nbavatar.fitting.light import Brightness, add_picture, estimate_light
 from nbavatar.io.images import linear_light
-from nbavatar.mesh.incidence import incidence, sphere_directions
+from nbavatar.math.directions import sphere_directions
+from nbavatar.mesh.incidence import incidence
 from nbavatar.mesh.zbuffer import joined_meshes
 from tests.unit.mesh.shapes import face_normals, sphere
 

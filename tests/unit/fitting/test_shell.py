@@ -201,6 +201,23 @@ def test_the_neck_goes_on_below_an_open_border_and_nowhere_else() -> None:
     assert not _in_neck(points, ball.vertices, np.asarray(ball.faces), 1.0, 0.3).any()  # no border
 
 
+def test_the_neck_is_as_wide_however_it_is_turned() -> None:
+    ball = trimesh.creation.icosphere(3, radius=1.0)
+    faces = np.asarray(ball.faces)[(ball.vertices[ball.faces][..., 1] > -0.8).all(1)]
+    away = np.linspace(0.6, 1.4, 801)
+    turns = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    points = np.stack(
+        [away[:, None] * np.cos(turns), 0 * away[:, None] * turns - 1.5, away[:, None] * np.sin(turns)], -1
+    )
+    upright = _in_neck(points.reshape(-1, 3), ball.vertices, faces, 1.0, 0.3).reshape(len(away), -1)
+    widths = away[upright.sum(0) - 1]
+    assert (widths > 0.75).all() and (widths < 1.05).all()  # 0.3 beside a border that is 0.5 to 0.7 away
+    for turn in Rotation.random(8, random_state=1).as_matrix():
+        found = _in_neck(points.reshape(-1, 3) @ turn.T, ball.vertices @ turn.T, faces, 1.0, 0.3).reshape(len(away), -1)
+        # One step of the scan, and the outline's chords in polar coordinates from another start.
+        assert np.abs(away[found.sum(0) - 1] - widths).max() < 0.005
+
+
 def _away(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Distance of points from a surface, by libigl."""
     import igl

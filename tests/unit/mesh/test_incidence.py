@@ -4,7 +4,8 @@ import igl
 import numpy as np
 import pytest
 
-from nbavatar.mesh.incidence import incidence, sphere_directions
+from nbavatar.math.directions import sphere_directions
+from nbavatar.mesh.incidence import incidence
 from nbavatar.mesh.zbuffer import joined_meshes
 from tests.unit.mesh.shapes import face_normals, sphere, torus
 
@@ -81,13 +82,8 @@ def test_what_is_not_lit_may_throw_shadows() -> None:
     assert incidence(verts, ball[:0], normals[:0], up).shape == (1, 0)
 
 
-def test_directions_are_even_and_vertices_must_be_numbers() -> None:
-    directions = sphere_directions(256)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-12)
-    # A face gets a quarter of a light that comes equally from everywhere, however it is turned.
-    normals = sphere(2)[0]
-    np.testing.assert_allclose(np.maximum(directions @ normals.T, 0).mean(0), 0.25, atol=2e-3)
+def test_vertices_must_be_numbers() -> None:
     verts, faces = sphere(1)
     verts[3, 1] = np.nan
     with pytest.raises(ValueError, match="not finite"):
-        incidence(verts, faces, np.ones((len(faces), 3)), directions)
+        incidence(verts, faces, np.ones((len(faces), 3)), sphere_directions(8))

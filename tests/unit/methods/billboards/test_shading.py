@@ -9,7 +9,8 @@ import torch
 from nbavatar.data.lights import Light
 from nbavatar.data.sequences import Part
 from nbavatar.errors import DataError
-from nbavatar.mesh.incidence import incidence, sphere_directions
+from nbavatar.math.directions import sphere_directions
+from nbavatar.mesh.incidence import incidence
 from nbavatar.methods.billboards.avatar import Avatar
 from nbavatar.methods.billboards.compression.reduce import keep_billboards, keep_parts
 from nbavatar.methods.billboards.initial import initial_avatar
