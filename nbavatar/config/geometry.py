@@ -114,7 +114,12 @@ class LightConfig:
     lights: int = option(
         0, "Most far lights that are kept, the strongest of those tried; 0 leaves the stage out.", min=0, max=4096
     )
-    directions: int = option(256, "Lights that are tried first, evenly spread over all directions; the strongest get neighbours.", min=8, max=4096)
+    directions: int = option(
+        256,
+        "Lights that are tried first, evenly spread over all directions; the strongest get neighbours.",
+        min=8,
+        max=4096,
+    )
     least: float = option(
         0.1, "Share of the change of brightness, in frames left out of the fit, that a light must explain to be kept.",
         min=0.0, max=1.0,
