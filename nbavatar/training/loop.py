@@ -1,4 +1,5 @@
-"""Training of one avatar by any method: Adam on all parameters, one view a step (paper, section 4.1; supplement A).
+"""Training of one avatar by any method, one view a step (paper, section 4.1; supplement A): Adam on all parameters, or
+Muon where a method's groups say `muon`.
 
 Every random number of a step comes from (seed, step), so a run that is cut off anywhere and resumed from its last
 checkpoint computes the same bits as an unbroken one (on the CPU, with the same number of threads). A step whose loss or
@@ -9,7 +10,7 @@ import contextlib
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +22,7 @@ from nbavatar.data.views import ViewStore, ViewStream
 from nbavatar.errors import NBAvatarError
 from nbavatar.methods.base import MeshAvatar, Method
 from nbavatar.optimization.adam import Adam
+from nbavatar.optimization.muon import Muon
 from nbavatar.optimization.schedule import Plan
 from nbavatar.training.determinism import sums_in_order
 from nbavatar.training.preview import contact_sheet
@@ -89,13 +91,15 @@ def train(
         avatar.restore(state["model"])  # first: the number of primitives may differ from the initial one
         method.load_state_dict(state["method"])
     groups = [{**group, "base": group["lr"]} for group in method.parameter_groups()]
-    optimizer = Adam(groups, eps=method.adam_eps)
+    optimizer = Adam((group for group in groups if not group.get("muon")), eps=method.adam_eps)
+    muon = Muon(group for group in groups if group.get("muon"))
     vertices = {part: meshes[part].to(device) for part in avatar.parts}
     anchors = _Anchors(avatar, vertices)
     clock = _Clock(method.total_steps(), config.max_minutes)
     step, skipped, in_a_row = 0, 0, 0
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
+        muon.load_state_dict(state.get("muon", {"momentum": {}}))  # no checkpoint of before has it
         step, skipped, in_a_row = state["step"], state["skipped"], state["in_a_row"]
         clock.seconds_before = state["seconds"]
     previews = _PreviewTimes(config.previews, clock.progress(step))
@@ -111,6 +115,7 @@ def train(
                 "model": avatar.state_dict(),
                 "method": method.state_dict(),
                 "optimizer": optimizer.state_dict(),
+                "muon": muon.state_dict(),
                 "step": step,
                 "skipped": skipped,
                 "in_a_row": in_a_row,
@@ -126,21 +131,23 @@ def train(
                 return _summary(False, step, clock, skipped, last, count, views, avatar)
             progress = clock.progress(step)
             plan = method.plan(progress, side, step)
-            _set_rates(optimizer, plan, progress)
+            _set_rates([*optimizer.param_groups, *muon.param_groups], plan, progress)
             sample = stream.get(step, plan.shrink)
             anchor = anchors.get(sample.view.row, sample.view.frame)
             random = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
             optimizer.zero_grad()
+            muon.zero_grad()
             total, terms, aux = method.step_loss(sample, anchor, lpips, plan, random)
             good = bool(torch.isfinite(total))
             if good:
                 total.backward()
                 good = _finite_gradients(avatar)
             if good:
-                for group in optimizer.param_groups:
+                for group in [*optimizer.param_groups, *muon.param_groups]:
                     if group.get("clip", 0.0) > 0:
                         nn.utils.clip_grad_norm_(group["params"], group["clip"])
                 optimizer.step()
+                muon.step()
                 method.after_step(optimizer, aux, step, progress, random)
                 in_a_row = 0
             else:
@@ -243,10 +250,10 @@ def _tensor_bytes(values: Any) -> int:
     return sum(_tensor_bytes(value) for value in values) if isinstance(values, tuple) else 0
 
 
-def _set_rates(optimizer: Adam, plan: Plan, progress: float) -> None:
+def _set_rates(groups: Sequence[dict[str, Any]], plan: Plan, progress: float) -> None:
     # A group with `final` decays exponentially to that factor, beside what the plan does to all groups.
     progress = min(max(progress, 0.0), 1.0)
-    for group in optimizer.param_groups:
+    for group in groups:
         group["lr"] = group["base"] * plan.rate * group.get("final", 1.0) ** progress
 
 

@@ -91,6 +91,12 @@ class BillboardsConfig:
     weight_delta: float = option(0.001, "Weight of the offsets, lambda_Delta.", min=0)
     dice: str = option("milletari", "Form of the Dice loss.", choices=("milletari", "haha"))
     rates: RatesConfig = option(RatesConfig, "Learning rates.")
+    unet_optimizer: str = option(
+        "adam",
+        "How the U-Net's convolutions learn: adam, as the paper's, or muon, which moves all directions of a weight "
+        "matrix alike and needs half as many steps; the rate means the same.",
+        choices=("adam", "muon"),
+    )
     texel_sharing: float = option(
         0.0, "Texels also take the mean gradient of their billboard, so many times; 0 for none, as in the paper.", min=0
     )

@@ -146,8 +146,15 @@ def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]
         {"name": "alpha", "lr": rates.alpha, "params": [billboards.alpha_logit]},
     ]
     if avatar.unet is not None:
-        network = list(avatar.unet.parameters())
-        groups.append({"name": "renderer", "lr": rates.renderer, "params": network, "clip": config.own.clip})
+        network, matrices = list(avatar.unet.parameters()), []
+        if config.own.unet_optimizer == "muon":
+            matrices = avatar.unet.hidden_weights()
+            own = {id(weight) for weight in matrices}
+            network = [parameter for parameter in network if id(parameter) not in own]
+        renderer = {"name": "renderer", "lr": rates.renderer, "params": network, "clip": config.own.clip}
+        groups.append(renderer)
+        if matrices:
+            groups.append({**renderer, "params": matrices, "muon": True})
     if avatar.refinement is not None:
         groups.append({"name": "refine", "lr": config.own.refine.rate, "params": list(avatar.refinement.parameters())})
     return [{**group, "lr": group["lr"] * config.rate_factor} for group in groups]

@@ -20,6 +20,7 @@ from nbavatar.methods.billboards.training import BillboardTraining
 from nbavatar.methods.create import create_method
 from nbavatar.metrics.lpips import load_lpips
 from nbavatar.optimization.adam import Adam
+from nbavatar.optimization.muon import Muon
 from nbavatar.optimization.schedule import Plan
 
 __all__ = ["FRAME", "StepScene", "training_options"]
@@ -42,7 +43,7 @@ class StepScene:
     """Method in its initial state, a view whose avatar fills the picture, and what a step needs beside.
 
     Attributes:
-        method, optimizer, lpips: of the options.
+        method, optimizer, muon, lpips: of the options.
         sample: the view.
         verts: vertices of its frame, by part.
         size: image side [px].
@@ -61,7 +62,9 @@ class StepScene:
         assert isinstance(method, BillboardTraining)
         method.avatar.train()
         self.method, self.verts = method, {name: values.to(device) for name, values in verts.items()}
-        self.optimizer = Adam(method.parameter_groups())
+        groups = method.parameter_groups()
+        self.optimizer = Adam(group for group in groups if not group.get("muon"))
+        self.muon = Muon(group for group in groups if group.get("muon"))
         self.lpips = load_lpips(config.lpips_net).to(device) if method.lpips_net() else None
         self._anchor = method.avatar.anchor(self.verts, FRAME)
 
@@ -72,11 +75,17 @@ class StepScene:
     def step(self, number: int = 0) -> None:
         """One step, as the trainer makes it, but for its checks."""
         self.optimizer.zero_grad()
+        self.muon.zero_grad()
         random = torch.Generator().manual_seed(0)
         lost = self.method.step_loss(self.sample, self._anchor, self.lpips, self.plan(number), random)
         lost.total.backward()
-        self.optimizer.step()
+        self.update()
         self.method.after_step(self.optimizer, lost.aux, number, 0.9, random)
+
+    def update(self) -> None:
+        """What the optimizers do with the gradients that are there."""
+        self.optimizer.step()
+        self.muon.step()
 
     def stepping(self) -> Callable[[], None]:
         """A function that makes the next step at every call."""

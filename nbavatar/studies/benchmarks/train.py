@@ -195,7 +195,7 @@ def _parts(scene: StepScene, crop: int) -> dict[str, Callable[[], None]]:
         parts["colours"] = compare
     if lpips is not None:
         parts["lpips"] = lambda: lpips(image, truth).sum().backward()
-    return {**parts, "optimizer": scene.optimizer.step}
+    return {**parts, "optimizer": scene.update}
 
 
 def _median(call: Callable[[], None], repeats: int, device: str) -> tuple[float, float]:

@@ -67,15 +67,16 @@ def test_train_is_deterministic_and_depends_on_the_seed(scene, tmp_path) -> None
     assert not same(first, other)
 
 
-@pytest.mark.parametrize("at", [1, 5, 11])
-def test_train_resumed_equals_unbroken_bit_for_bit(scene, tmp_path, at: int) -> None:
-    whole, _ = run(scene, CONFIG, tmp_path / "whole")
+@pytest.mark.parametrize(("at", "optimizer"), [(1, "adam"), (5, "adam"), (11, "adam"), (5, "muon")])
+def test_train_resumed_equals_unbroken_bit_for_bit(scene, tmp_path, at: int, optimizer: str) -> None:
+    config = train_config(CONFIG, unet_optimizer=optimizer)
+    whole, _ = run(scene, config, tmp_path / "whole")
     calls = iter(range(100))
-    _, cut = run(scene, CONFIG, tmp_path / "cut", should_stop=lambda: next(calls) == at)
+    _, cut = run(scene, config, tmp_path / "cut", should_stop=lambda: next(calls) == at)
     assert not cut["finished"] and cut["steps"] == at
-    resumed, summary = run(scene, CONFIG, tmp_path / "cut")
+    resumed, summary = run(scene, config, tmp_path / "cut")
     assert summary["finished"] and same(whole, resumed)
-    events = [RunFolder(tmp_path / name, {"config": to_mapping(CONFIG)}).events() for name in ("whole", "cut")]
+    events = [RunFolder(tmp_path / name, {"config": to_mapping(config)}).events() for name in ("whole", "cut")]
     steps = [[event["step"] for event in found] for found in events]
     assert steps[0] == steps[1] == sorted(set(steps[0]))
 
@@ -102,6 +103,20 @@ def test_parameter_groups_have_the_rates_of_the_supplement(scene) -> None:
         assert rates == expected
         grouped = sum(p.numel() for group in parameter_groups(avatar, config) for p in group["params"])
         assert grouped == sum(p.numel() for p in avatar.parameters())
+
+
+def test_muon_moves_the_hidden_convolutions_and_adam_the_rest(scene) -> None:
+    meshes, _ = read_sequence(scene["meshes"])
+    config = train_config(CONFIG, init="random", unet_optimizer="muon", clip=0.5, rates={"renderer": 4e-3})
+    avatar = initial_avatar(meshes, {}, [], config)
+    groups = parameter_groups(avatar, config)
+    parameters = [id(p) for group in groups for p in group["params"]]
+    assert sorted(parameters) == sorted(id(p) for p in avatar.parameters())
+    (muon,) = (group for group in groups if group.get("muon"))
+    assert muon["lr"] == 4e-3 and muon["clip"] == 0.5
+    assert avatar.unet is not None and [id(p) for p in muon["params"]] == [id(p) for p in avatar.unet.hidden_weights()]
+    plain = initial_avatar(meshes, {}, [], train_config(CONFIG, init="random", deferred=False, unet_optimizer="muon"))
+    assert not any(group.get("muon") for group in parameter_groups(plain, config))
 
 
 def test_bad_steps_are_skipped_counted_and_end_the_training_with_one_line(scene, tmp_path) -> None:

@@ -5,7 +5,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from nbavatar.methods.billboards.unet import UNet, macs
+from nbavatar.methods.billboards.unet import FORMS, UNet, macs
 
 
 @pytest.mark.parametrize(("height", "width"), [(32, 32), (64, 32), (96, 160)])
@@ -31,6 +31,16 @@ def test_unet_has_the_layers_of_the_supplement() -> None:
     assert any(isinstance(m, nn.InstanceNorm2d) for m in network.modules())
     upsample = next(m for m in network.modules() if isinstance(m, nn.Upsample))
     assert upsample.mode == "bilinear"
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_all_convolutions_but_the_last_are_hidden(form: str) -> None:
+    network = UNet(7, width=4, depth=3, convs=2, form=form)
+    last = [network.head] if form == "lean" else [network.colour, network.opacity]
+    every = [id(m.weight) for m in network.modules() if isinstance(m, nn.Conv2d)]
+    hidden = [id(weight) for weight in network.hidden_weights()]
+    assert hidden == [weight for weight in every if weight not in {id(m.weight) for m in last}]
+    assert len(hidden) == len(every) - len(last) and sum(m.weight.shape[0] for m in last) == 4
 
 
 def test_unet_single_pixel_bottleneck_trains() -> None:
