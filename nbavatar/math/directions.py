@@ -27,7 +27,7 @@ def axes_along(directions: np.ndarray) -> np.ndarray:
     Returns:
         float64 (K, 3, 3), an axis a row.
     """
-    # The helper is never within 37 degrees of the direction, so the cross product keeps its digits.
+    # The helper is never within 36 degrees of the direction, so the cross product keeps its digits.
     helper = np.where(np.abs(directions[:, :1]) < 0.6, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     right = np.cross(helper, directions)
     right /= np.linalg.norm(right, axis=1, keepdims=True)

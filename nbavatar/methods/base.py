@@ -1,8 +1,8 @@
 """What a method gives: its avatar (`MeshAvatar`) and how that is trained (`Method`).
 
 Rendering, evaluation, timing and storage know an avatar by `MeshAvatar` only; the trainer (`nbavatar.training.loop`)
-knows a method by `Method` only. The trainer owns the data, the clock, Adam, checkpoints and pictures; a method owns the
-rest: which avatar, at which rates, by which loss, and what is done between steps. Methods are listed in
+knows a method by `Method` only. The trainer owns the data, the clock, optimizers, checkpoints and pictures; a method
+owns the rest: which avatar, at which rates, by which loss, and what is done between steps. Methods are listed in
 `nbavatar.methods.registry`.
 """
 
@@ -298,7 +298,7 @@ class Method(ABC):
         """
 
     def take_over(self, other: MeshAvatar, parts: Sequence[str]) -> Taken:
-        """Values of another avatar in place of the initial ones, before the first step and before Adam is made.
+        """Values of another avatar in place of the initial ones, before the optimizers are made.
 
         Args:
             other: of the same method, on the same device.
@@ -318,10 +318,11 @@ class Method(ABC):
 
     @abstractmethod
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Adam groups over all parameters of the avatar.
+        """Groups of parameters for Adam, over all parameters of the avatar.
 
         Each has `name`, `params`, `lr` (the rate at the start), and may have `final` (factor on the rate at the end,
-        reached exponentially) and `clip` (largest norm of its gradient).
+        reached exponentially), `clip` (largest norm of its gradient), and `muon`: its parameters, weights of two
+        dimensions or more whose rows stay, are moved by Muon instead.
         """
 
     def total_steps(self) -> int:

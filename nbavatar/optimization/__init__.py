@@ -1,1 +1,1 @@
-"""One step of training: Adam, and the settings of a step over time."""
+"""One step of training: Adam, Muon, and the settings of a step over time."""

@@ -121,4 +121,8 @@ class Adam:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Takes over what `state_dict` gave, for the same parameters in the same order."""
-        self._state = {int(index): (first, second, count) for index, (first, second, count) in state["state"].items()}
+        parameters = [parameter for group in self.param_groups for parameter in group["params"]]
+        self._state = {}
+        for index, values in state["state"].items():
+            first, second, count = (value.to(parameters[int(index)].device) for value in values)
+            self._state[int(index)] = (first, second, count)

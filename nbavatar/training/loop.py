@@ -22,7 +22,7 @@ from nbavatar.data.views import ViewStore, ViewStream
 from nbavatar.errors import NBAvatarError
 from nbavatar.methods.base import MeshAvatar, Method
 from nbavatar.optimization.adam import Adam
-from nbavatar.optimization.muon import Muon
+from nbavatar.optimization.muon import Muon, split_groups
 from nbavatar.optimization.schedule import Plan
 from nbavatar.training.determinism import sums_in_order
 from nbavatar.training.preview import contact_sheet
@@ -91,15 +91,15 @@ def train(
         avatar.restore(state["model"])  # first: the number of primitives may differ from the initial one
         method.load_state_dict(state["method"])
     groups = [{**group, "base": group["lr"]} for group in method.parameter_groups()]
-    optimizer = Adam((group for group in groups if not group.get("muon")), eps=method.adam_eps)
-    muon = Muon(group for group in groups if group.get("muon"))
+    for_adam, for_muon = split_groups(groups)
+    optimizer, muon = Adam(for_adam, eps=method.adam_eps), Muon(for_muon)
     vertices = {part: meshes[part].to(device) for part in avatar.parts}
     anchors = _Anchors(avatar, vertices)
     clock = _Clock(method.total_steps(), config.max_minutes)
     step, skipped, in_a_row = 0, 0, 0
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
-        muon.load_state_dict(state.get("muon", {"momentum": {}}))  # no checkpoint of before has it
+        muon.load_state_dict(state["muon"])
         step, skipped, in_a_row = state["step"], state["skipped"], state["in_a_row"]
         clock.seconds_before = state["seconds"]
     previews = _PreviewTimes(config.previews, clock.progress(step))

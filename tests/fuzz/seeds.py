@@ -97,7 +97,14 @@ def state(folder: Path) -> Path:
     run = RunFolder(folder / "model.pt.state", {"key": 1})
     model = _avatar("gaussian_avatars")
     run.save(
-        {"model": model.state_dict(), "method": {}, "optimizer": {"m": [torch.zeros(3)]}, "step": 5, "seconds": 1.0}
+        {
+            "model": model.state_dict(),
+            "method": {},
+            "optimizer": {"m": [torch.zeros(3)]},
+            "muon": {"momentum": {0: torch.zeros(2, 3)}},
+            "step": 5,
+            "seconds": 1.0,
+        }
     )
     for step in (1, 3, 7):
         run.log({"step": step, "loss": 0.5, "psnr": 20.0})

@@ -23,7 +23,7 @@ class UNetConfig:
 
 @dataclass(frozen=True)
 class RatesConfig:
-    """Adam learning rates (supplement, 'Optimization details')."""
+    """Learning rates (supplement, 'Optimization details')."""
 
     renderer: float = option(1e-3, "U-Net.", min=0)
     features: float = option(5e-4, "Neural textures.", min=0)
@@ -93,14 +93,17 @@ class BillboardsConfig:
     rates: RatesConfig = option(RatesConfig, "Learning rates.")
     unet_optimizer: str = option(
         "adam",
-        "How the U-Net's convolutions learn: adam, as the paper's, or muon, which moves all directions of a weight "
-        "matrix alike and needs half as many steps; the rate means the same.",
+        "How the weights of the U-Net's convolutions learn, but for the last ones: adam, as in the paper, or muon, "
+        "which moves all directions of a weight matrix alike (captures: about as good after half as many steps). "
+        "Steps have the same size.",
         choices=("adam", "muon"),
     )
     texel_sharing: float = option(
         0.0, "Texels also take the mean gradient of their billboard, so many times; 0 for none, as in the paper.", min=0
     )
-    clip: float = option(0.0, "Largest gradient norm of the renderer; 0 = no clipping.", min=0)
+    clip: float = option(
+        0.0, "Largest gradient norm of the renderer, with muon of its matrices and of the rest; 0 = no clipping.", min=0
+    )
     refine: RefineConfig = option(RefineConfig, "Compensation of fitting errors.")
     roi: bool = option(True, "Decode only a window around the avatar.")
     roi_margin: float = option(0.15, "Margin of that window, in its own size (hair has no mesh).", min=0)

@@ -132,7 +132,7 @@ def shared_gradient(gradient: Tensor, share: float) -> Tensor:
 
 
 def parameter_groups(avatar: Avatar, config: TrainConfig) -> list[dict[str, Any]]:
-    """Adam groups with the rates of the supplement (`Method.parameter_groups`)."""
+    """Groups with the rates of the supplement (`Method.parameter_groups`)."""
     billboards, rates = avatar.billboards, config.own.rates
     groups: list[dict[str, Any]] = [
         {"name": "position", "lr": rates.position, "params": [billboards.mu], "final": rates.position_final},

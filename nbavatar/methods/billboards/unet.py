@@ -116,7 +116,7 @@ class UNet(nn.Module):
             self.opacity = nn.Conv2d(widths[0], 1, 3, padding=1)
         self.upsample = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
 
-    def hidden_weights(self) -> list[nn.Parameter]:
+    def hidden_weights(self) -> list[Tensor]:
         """Weights (N, D, k, k) of all convolutions but those that make colour and opacity."""
         last = (self.head,) if self.lean else (self.colour, self.opacity)
         return [m.weight for m in self.modules() if isinstance(m, nn.Conv2d) and m not in last]

@@ -20,7 +20,7 @@ from nbavatar.methods.billboards.training import BillboardTraining
 from nbavatar.methods.create import create_method
 from nbavatar.metrics.lpips import load_lpips
 from nbavatar.optimization.adam import Adam
-from nbavatar.optimization.muon import Muon
+from nbavatar.optimization.muon import Muon, split_groups
 from nbavatar.optimization.schedule import Plan
 
 __all__ = ["FRAME", "StepScene", "training_options"]
@@ -62,9 +62,8 @@ class StepScene:
         assert isinstance(method, BillboardTraining)
         method.avatar.train()
         self.method, self.verts = method, {name: values.to(device) for name, values in verts.items()}
-        groups = method.parameter_groups()
-        self.optimizer = Adam(group for group in groups if not group.get("muon"))
-        self.muon = Muon(group for group in groups if group.get("muon"))
+        for_adam, for_muon = split_groups(method.parameter_groups())
+        self.optimizer, self.muon = Adam(for_adam), Muon(for_muon)
         self.lpips = load_lpips(config.lpips_net).to(device) if method.lpips_net() else None
         self._anchor = method.avatar.anchor(self.verts, FRAME)
 

@@ -19,5 +19,6 @@ def test_axes_are_rotations_whose_third_row_is_the_direction() -> None:
     directions = np.concatenate([poles, sphere_directions(500)])
     axes = axes_along(directions)
     np.testing.assert_array_equal(axes[:, 2], directions)
-    np.testing.assert_allclose(axes @ axes.swapaxes(1, 2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-15)
-    np.testing.assert_allclose(np.linalg.det(axes), 1.0, atol=1e-15)
+    # A few roundings.
+    np.testing.assert_allclose(axes @ axes.swapaxes(1, 2), np.broadcast_to(np.eye(3), axes.shape), atol=4e-15)
+    np.testing.assert_allclose(np.linalg.det(axes), 1.0, atol=4e-15)

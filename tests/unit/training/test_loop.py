@@ -25,6 +25,7 @@ from nbavatar.io.framepack import FramePack
 from nbavatar.methods.billboards.initial import initial_avatar
 from nbavatar.methods.billboards.training import parameter_groups
 from nbavatar.methods.create import create_method
+from nbavatar.optimization.muon import Muon
 from nbavatar.training.loop import train
 from nbavatar.training.state import RunFolder
 from tests.scenes.toy import sequence, write_scene
@@ -117,6 +118,32 @@ def test_muon_moves_the_hidden_convolutions_and_adam_the_rest(scene) -> None:
     assert avatar.unet is not None and [id(p) for p in muon["params"]] == [id(p) for p in avatar.unet.hidden_weights()]
     plain = initial_avatar(meshes, {}, [], train_config(CONFIG, init="random", deferred=False, unet_optimizer="muon"))
     assert not any(group.get("muon") for group in parameter_groups(plain, config))
+
+
+def test_the_trainer_moves_matrices_by_muon_at_the_rate_of_the_moment(scene, tmp_path, monkeypatch) -> None:
+    rates = []
+    step = Muon.step
+
+    def watched(self) -> None:
+        rates.extend(group["lr"] for group in self.param_groups)
+        step(self)
+
+    monkeypatch.setattr(Muon, "step", watched)
+    config = train_config(CONFIG, steps=12, schedule="fast", unet_optimizer="muon", rates={"renderer": 4e-3})
+    run(scene, config, tmp_path / "whole")
+    assert len(rates) == 12 and rates[0] == 4e-3 and rates[-1] < 0.5 * rates[0] and rates == sorted(rates, reverse=True)
+    once = train_config(config, steps=1, schedule="paper")
+    moved, _ = run(scene, once, tmp_path / "muon")
+    other, _ = run(scene, train_config(once, unet_optimizer="adam"), tmp_path / "adam")
+    meshes, _ = read_sequence(scene["meshes"])
+    coords = {k[: -len(".coords")]: v for k, v in np.load(scene["spectral"]).items() if k.endswith(".coords")}
+    start = initial_avatar(meshes, coords, [], once)
+    hidden = {id(weight) for weight in moved.unet.hidden_weights()}
+    # The first steps see the same gradients: matrices differ, all else has Adam's bits.
+    for a, b, before in zip(moved.parameters(), other.parameters(), start.parameters(), strict=True):
+        assert torch.equal(a, b) == (id(a) not in hidden)
+        if id(a) in hidden:
+            assert 0.1 < float((a - before).detach().square().mean().sqrt()) / 4e-3 < 0.25
 
 
 def test_bad_steps_are_skipped_counted_and_end_the_training_with_one_line(scene, tmp_path) -> None:
