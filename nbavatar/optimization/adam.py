@@ -10,6 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nbavatar.optimization.groups import forget_gradients
+
 __all__ = ["Adam"]
 
 
@@ -34,9 +36,7 @@ class Adam:
 
     def zero_grad(self) -> None:
         """Forgets all gradients."""
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                parameter.grad = None
+        forget_gradients(self.param_groups)
 
     @torch.no_grad()
     def step(self) -> None:

@@ -13,7 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Muon", "orthogonalized", "split_groups"]
+from nbavatar.optimization.groups import forget_gradients
+
+__all__ = ["Muon", "orthogonalized"]
 
 # Jordan's momentum, rounds and quintic s -> a s + b s^3 + c s^5: what is over 0.0015 of the norm ends in [0.68, 1.21].
 _MOMENTUM = 0.95
@@ -40,9 +42,7 @@ class Muon:
 
     def zero_grad(self) -> None:
         """Forgets all gradients."""
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                parameter.grad = None
+        forget_gradients(self.param_groups)
 
     @torch.no_grad()
     def step(self) -> None:
@@ -68,12 +68,6 @@ class Muon:
         """Takes over what `state_dict` gave, for the same weights in the same order."""
         weights = [weight for group in self.param_groups for weight in group["params"]]
         self._momentum = {int(i): value.to(weights[int(i)].device) for i, value in state["momentum"].items()}
-
-
-def split_groups(groups: Iterable[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Groups for Adam, and those that say `muon`."""
-    every = list(groups)
-    return [group for group in every if not group.get("muon")], [group for group in every if group.get("muon")]
 
 
 def orthogonalized(matrix: Tensor) -> Tensor:

@@ -22,7 +22,8 @@ from nbavatar.data.views import ViewStore, ViewStream
 from nbavatar.errors import NBAvatarError
 from nbavatar.methods.base import MeshAvatar, Method
 from nbavatar.optimization.adam import Adam
-from nbavatar.optimization.muon import Muon, split_groups
+from nbavatar.optimization.groups import split_groups
+from nbavatar.optimization.muon import Muon
 from nbavatar.optimization.schedule import Plan
 from nbavatar.training.determinism import sums_in_order
 from nbavatar.training.preview import contact_sheet

@@ -20,7 +20,8 @@ from nbavatar.methods.billboards.training import BillboardTraining
 from nbavatar.methods.create import create_method
 from nbavatar.metrics.lpips import load_lpips
 from nbavatar.optimization.adam import Adam
-from nbavatar.optimization.muon import Muon, split_groups
+from nbavatar.optimization.groups import split_groups
+from nbavatar.optimization.muon import Muon
 from nbavatar.optimization.schedule import Plan
 
 __all__ = ["FRAME", "StepScene", "training_options"]
