@@ -94,6 +94,7 @@ def train(
     groups = [{**group, "base": group["lr"]} for group in method.parameter_groups()]
     for_adam, for_muon = split_groups(groups)
     optimizer, muon = Adam(for_adam, eps=method.adam_eps), Muon(for_muon)
+    moved = [*optimizer.param_groups, *muon.param_groups]
     vertices = {part: meshes[part].to(device) for part in avatar.parts}
     anchors = _Anchors(avatar, vertices)
     clock = _Clock(method.total_steps(), config.max_minutes)
@@ -132,7 +133,7 @@ def train(
                 return _summary(False, step, clock, skipped, last, count, views, avatar)
             progress = clock.progress(step)
             plan = method.plan(progress, side, step)
-            _set_rates([*optimizer.param_groups, *muon.param_groups], plan, progress)
+            _set_rates(moved, plan, progress)
             sample = stream.get(step, plan.shrink)
             anchor = anchors.get(sample.view.row, sample.view.frame)
             random = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
@@ -144,7 +145,7 @@ def train(
                 total.backward()
                 good = _finite_gradients(avatar)
             if good:
-                for group in [*optimizer.param_groups, *muon.param_groups]:
+                for group in moved:
                     if group.get("clip", 0.0) > 0:
                         nn.utils.clip_grad_norm_(group["params"], group["clip"])
                 optimizer.step()
